@@ -117,9 +117,9 @@ def joint_of(names: Sequence[str], seed: int) -> tuple[JointFile, JointFile]:
     return parse(JOINT.format(effect="", **text)), parse(JOINT.format(effect=", ".join(effects), **text))
 
 
-def measured(joint: JointFile, seconds: float) -> Record:
-    """A recording of the joint's world."""
-    columns = record(world_from_joint(joint), seconds)
+def measured(joint: JointFile, seconds: float, effects: Sequence[str] = ()) -> Record:
+    """A recording of the joint's world, with further effects."""
+    columns = record(world_from_joint(joint, effects=effects), seconds)
     return Record(
         period_s=joint.bus.period_s,
         sequence=np.arange(len(columns["time_s"])),

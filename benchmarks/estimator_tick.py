@@ -17,14 +17,13 @@ from dataclasses import replace
 
 import numpy as np
 import scene
+from diagnosis_seeds import measured
 from rig import free_endpoint
 from rig import joint as joint_file
 
-from drivelink.demo.simulate import world_from_joint
 from estimator import EstimatorSettings, JointModel, Motor, Record, Sample, Transmission, fit, make_estimator
 from estimator.diagnosis import diagnose
 from estimator.model_monitor import ModelMonitor, measure_baseline
-from sim.world import record as recorded
 
 T = 1e-3
 _CASES = {
@@ -113,14 +112,7 @@ def batch(name: str) -> float:
 def diagnosis(seconds: float) -> float:
     """CPU seconds to diagnose one motor at 1 kHz."""
     declared = joint_file("robust", free_endpoint(), motors=1)
-    columns = recorded(world_from_joint(declared, effects=["coulomb_friction=0.0005"]), seconds)
-    data = Record(
-        period_s=T,
-        sequence=np.arange(len(columns["time_s"])),
-        motor_position_rad=columns["motor1_position_rad"][:, None],
-        motor_torque_nm=columns["motor1_torque_nm"][:, None],
-        link_position_rad=columns["link_position_rad"],
-    )
+    data = measured(declared, seconds, ["coulomb_friction=0.0005"])
     begin = time.thread_time()
     diagnose(data, declared.model())
     return time.thread_time() - begin

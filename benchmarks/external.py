@@ -27,7 +27,7 @@ from __future__ import annotations
 import math
 import os
 import statistics
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -35,24 +35,11 @@ from typing import Any
 import numpy as np
 import scene
 
-from estimator import (
-    Effect,
-    EstimatorSettings,
-    ExternalStatus,
-    JointModel,
-    LinkDynamics,
-    Motor,
-    Sample,
-    Transmission,
-    make_estimator,
-)
+from drivelink.demo.simulate import world_from_joint
+from drivelink.jointfile import JointFile, parse
+from estimator import Effect, EstimatorSettings, ExternalStatus, JointModel, Sample, make_estimator
 from estimator.filters import StateVariableFilter
-from sim.cases import case
-from sim.effects import parse
-from sim.excitation import build
-from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
-from sim.sensors import DriveHardware, LinkEncoder
-from sim.world import World
+from sim.plant import MotorPlant
 
 T = 0.001
 LEARN_S = 40.0  # free motion before the pushes, in which drivelink estimates the springs
@@ -66,138 +53,117 @@ NOMINAL = 0.9  # a data sheet's spring over the true one
 LARGE, TYPICAL = 0.2, 0.5  # of gravity
 BANDWIDTH = EstimatorSettings().external_bandwidth_rad_s
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JointUnderTest:
-    """A joint as it is."""
-
-    title: str
-    plant: JointPlant
-    drives: tuple[DriveHardware, ...]
-    encoder: LinkEncoder
-    excitation: dict[str, Any]
-    effects: tuple[str, ...]
-    transmission: Transmission
-    known: tuple[Effect, ...] = ()
-
-    def world(self, seed: int, external: Callable[[float], float] | None = None) -> World:
-        excitation = replace(build(self.excitation, len(self.drives)), external=external)
-        effects = [parse(text) for text in self.effects]
-        parts = self.plant, self.drives, self.encoder
-        return World(*parts, excitation=excitation, effects=effects, period_s=T, seed=seed)
-
-    def model(self, error: float) -> JointModel:
-        """What is declared, inertia and gravity off by this share."""
-        link = self.plant.link
-        M, g = link.inertia_kg_m2, link.gravity_nm
-        motors = tuple(
-            Motor(
-                inertia_kg_m2=motor.inertia_kg_m2,
-                viscous_damping_nm_s_rad=motor.viscous_damping_nm_s_rad,
-                transmission=self.transmission,
-                effects=self.known,
-            )
-            for motor in self.plant.motors
-        )
-        dynamics = LinkDynamics(
-            inertia_kg_m2=(1.0 + error) * M,
-            viscous_damping_nm_s_rad=link.viscous_damping_nm_s_rad,
-            gravity_nm=(1.0 + error) * g,
-            inertia_std_kg_m2=error * M,
-            viscous_damping_std_nm_s_rad=error * link.viscous_damping_nm_s_rad,
-            gravity_std_nm=error * g,
-        )
-        return JointModel(arrangement=self.plant.arrangement, motors=motors, link=dynamics)
+MOTOR = """[[motor]]
+inertia_kg_m2 = {inertia}
+viscous_damping_nm_s_rad = {damping}
+transmission = {{ model = "{model}"{spring} }}
+drive = {{ node_id = 1{drive} }}
+effect = [{effects}]
+"""
+JOINT = """name = "external"
+arrangement = "{arrangement}"
+{motors}
+[link]
+encoder = {{ source = "cia406", node_id = 3{link_counts} }}
+[link.dynamics]
+inertia_kg_m2 = {link[0]}
+viscous_damping_nm_s_rad = {link[1]}
+gravity_nm = {link[2]}
+[sim]
+{case}
+excitation = {{ kind = "rich"{moved} }}
+"""
+VSA = JOINT.format(
+    arrangement="antagonistic",
+    motors=2 * MOTOR.format(inertia=5e-4, damping=5e-3, model="vsa-ii", spring="", drive="", effects=""),
+    link_counts="",
+    link=(0.003, 0.001, 0.2943),
+    case='case = "vsa-ii"',
+    moved="",
+)
 
 
-def _friction(name: str, shape: dict[str, float] | None = None, **torques: float) -> Effect:
-    """As diagnose finds it: 10 % too low."""
-    values = {key: KNOWN * value for key, value in torques.items()}
-    return Effect(name=name, parameters=values | {"smoothing_rad_s": 0.01} | (shape or {}))
-
-
-def _vsa() -> JointUnderTest:
-    vsa = case("vsa-ii")
-    return JointUnderTest(
-        title="VSA-II (the paper's), no friction",
-        plant=vsa.plant,
-        drives=vsa.drives,
-        encoder=vsa.encoder,
-        excitation=dict(vsa.rich),
-        effects=(),
-        transmission=Transmission(model="vsa-ii"),
-    )
-
-
-def _single(
-    title: str,
-    spring: tuple[float, float],
+def single(
     motor: tuple[float, float],
     link: tuple[float, float, float],
+    spring: list[float],
     gear: tuple[float, float],
-    link_bits: int,
+    bits: int,
     moved: tuple[float, float, float],
-    effects: tuple[str, ...],
-    known: tuple[Effect, ...],
-) -> JointUnderTest:
-    """A joint with one motor: coefficients, (B, D), (M, Dq, g), (ratio, N·m/A), motion and its centring."""
-    law = Spring(model="polynomial", parameters={"coefficients_nm_rad": spring})
-    B, D = motor
-    M, Dq, g = link
-    drive = DriveHardware(
-        counts_per_rev=4096.0, gear_ratio=gear[0], torque_constant_nm_a=gear[1], rated_current_a=6.0,
-        current_noise_a=0.012,
-    )  # fmt: skip
+    effects: str,
+) -> str:
+    """A joint with one motor: (B, D), (M, Dq, g), coefficients, (ratio, N·m/A), motion and its centring."""
     names = ("amplitude_nm", "centring_nm_rad", "centring_nm_s_rad")
-    return JointUnderTest(
-        title=title,
-        plant=JointPlant(
-            arrangement="single",
-            motors=(MotorPlant(inertia_kg_m2=B, viscous_damping_nm_s_rad=D, spring=law),),
-            link=LinkPlant(inertia_kg_m2=M, viscous_damping_nm_s_rad=Dq, gravity_nm=g),
+    drive = ", counts_per_rev = 4096, rated_current_a = 6.0"
+    drive += f", gear_ratio = {gear[0]}, torque_constant_nm_a = {gear[1]}"
+    law = f", order = 2, parameters = {{ coefficients_nm_rad = {spring} }}"
+    return JOINT.format(
+        arrangement="single",
+        motors=MOTOR.format(
+            inertia=motor[0], damping=motor[1], model="polynomial", spring=law, drive=drive, effects=effects
         ),
-        drives=(drive,),
-        encoder=LinkEncoder(counts_per_rev=2.0**link_bits),
-        excitation={"kind": "rich", "low_hz": 0.15, "high_hz": 4.0, **dict(zip(names, moved, strict=True))},
-        effects=effects,
-        transmission=Transmission(model="polynomial", order=2),
-        known=known,
+        link_counts=f", counts_per_rev = {2**bits}",
+        link=link,
+        case="",
+        moved=", low_hz = 0.15, high_hz = 4.0"
+        + "".join(f", {name} = {value}" for name, value in zip(names, moved, strict=True)),
     )
 
 
-def _sea() -> JointUnderTest:
-    """The SEA of docs: dry friction of 5 % of the rated torque."""
-    known = (_friction("coulomb_friction", torque_nm=0.75),)
-    return _single(
-        "SEA, 150 N·m/rad, gear 50", (150.0, 1500.0), (0.125, 0.8), (0.4, 0.1, 6.0), (50.0, 0.05), 17,
-        (8.0, 10.0, 1.0), ("coulomb_friction=0.75",), known,
-    )  # fmt: skip
+COULOMB = '{ name = "coulomb_friction", parameters = { torque_nm = 0.75 } }'
+LOSSES = """{ name = "stribeck_friction", parameters = { torque_nm = 5.0, stribeck_nm = 2.0 } },
+{ name = "load_dependent_friction", parameters = { coefficient = 0.06 } }"""
+RIGS = {
+    "vsa": ("VSA-II (the paper's), no friction", VSA),
+    "sea": (  # of the documentation: dry friction of 5 % of the rated torque
+        "SEA, 150 N·m/rad, gear 50",
+        single((0.125, 0.8), (0.4, 0.1, 6.0), [150.0, 1500.0], (50.0, 0.05), 17, (8.0, 10.0, 1.0), COULOMB),
+    ),
+    "hd": (
+        "harmonic drive, 8000 N·m/rad, gear 100",
+        single((1.5, 8.0), (2.0, 1.0, 30.0), [8000.0, 1.0e8], (100.0, 0.1), 20, (40.0, 40.0, 10.0), LOSSES),
+    ),
+}
 
 
-def _hd() -> JointUnderTest:
-    """A harmonic drive: stiff, Stribeck and load-dependent friction."""
-    known = (
-        _friction("stribeck_friction", {"stribeck_velocity_rad_s": 0.1}, torque_nm=5.0, stribeck_nm=2.0),
-        _friction("load_dependent_friction", coefficient=0.06),
+def declared(joint: JointFile, error: float) -> JointModel:
+    """The model in drivelink's joint file: springs unknown, friction too low, link off by a share."""
+    model, link = joint.model(), joint.link.dynamics
+    assert link is not None and model.link is not None
+    motors = tuple(
+        replace(
+            motor,
+            transmission=replace(motor.transmission, parameters={}),
+            effects=tuple(_too_low(effect) for effect in motor.effects),
+        )
+        for motor in model.motors
     )
-    effects = ("stribeck_friction=5.0,stribeck_nm=2.0", "load_dependent_friction=0.06")
-    return _single(
-        "harmonic drive, 8000 N·m/rad, gear 100", (8000.0, 1.0e8), (1.5, 8.0), (2.0, 1.0, 30.0), (100.0, 0.1),
-        20, (40.0, 40.0, 10.0), effects, known,
-    )  # fmt: skip
+    dynamics = replace(
+        model.link,
+        inertia_kg_m2=(1.0 + error) * link.inertia_kg_m2,
+        gravity_nm=(1.0 + error) * link.gravity_nm,
+        inertia_std_kg_m2=error * link.inertia_kg_m2,
+        viscous_damping_std_nm_s_rad=error * link.viscous_damping_nm_s_rad,
+        gravity_std_nm=error * link.gravity_nm,
+    )
+    return replace(model, motors=motors, link=dynamics)
 
 
-RIGS = {"vsa": _vsa, "sea": _sea, "hd": _hd}
+def _too_low(effect: Effect) -> Effect:
+    """As diagnose finds it: 10 % too low."""
+    shapes = {"smoothing_rad_s", "stribeck_velocity_rad_s"}
+    scaled = {k: v if k in shapes else KNOWN * v for k, v in effect.parameters.items()}
+    return replace(effect, parameters=scaled | {"smoothing_rad_s": 0.01})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """What the sensors said: (n, motors) positions and torques at the joint, (n,) link; and the true push."""
+    """What the sensors read: (n, motors) positions and torques at the joint, (n,) link; its springs."""
 
     theta: np.ndarray
     tau: np.ndarray
     q: np.ndarray
-    push: np.ndarray
+    motors: tuple[MotorPlant, ...]
 
 
 def pushes(scale: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -208,16 +174,18 @@ def pushes(scale: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return np.round(begins / T) * T, sizes
 
 
-def simulate(rig: JointUnderTest, seconds: float, seed: int, pushed: bool) -> Motion:
+def simulate(joint: JointFile, seconds: float, seed: int, pushed: bool) -> Motion:
     """Run the world."""
-    external, n = None, round(seconds / T)
-    profile = np.zeros(n)
+    n, world = round(seconds / T), world_from_joint(joint, seed=seed)
     if pushed:
-        for begin, size in zip(*pushes(rig.plant.link.gravity_nm, seed), strict=True):
+        assert joint.link.dynamics is not None and world.excitation is not None
+        profile = np.zeros(n)
+        for begin, size in zip(*pushes(joint.link.dynamics.gravity_nm, seed), strict=True):
             at = round(begin / T)
             profile[at : at + round(PUSH_S / T)] = size
-        external = lambda t: profile[min(n - 1, round(t / T))]  # noqa: E731
-    world = rig.world(seed, external)
+        world.excitation = replace(
+            world.excitation, external=lambda t: float(profile[min(n - 1, round(t / T))])
+        )
     m = world.motors
     theta, tau, q = np.empty((n, m)), np.empty((n, m)), np.empty(n)
     for k in range(n):
@@ -228,24 +196,21 @@ def simulate(rig: JointUnderTest, seconds: float, seed: int, pushed: bool) -> Mo
             theta[k, i] = signals.position_counts / drive.counts_per_rad
             tau[k, i] = signals.current_a * drive.joint_torque_per_ampere
         q[k] = world.link_counts() / world.encoder.counts_per_rad
-    return Motion(theta, tau, q, profile)
+    return Motion(theta, tau, q, world.plant.motors)
 
 
 def ours(model: JointModel, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """drivelink's external torque, where it is valid, and its contact bit."""
+    """drivelink's external torque, whether it is valid, and its contact bit."""
     estimator = make_estimator(model, EstimatorSettings(contact_torque_nm=0.0), T)
-    n, nothing = len(motion.q), (math.nan,) * motion.theta.shape[1]
-    torque, status = np.full(n, math.nan), np.zeros(n, dtype=np.int64)
-    rows = zip(
-        map(tuple, motion.theta.tolist()), map(tuple, motion.tau.tolist()), motion.q.tolist(), strict=True
-    )
+    nothing = (math.nan,) * motion.theta.shape[1]
+    torque, status = np.empty(len(motion.q)), np.zeros(len(motion.q), dtype=np.int64)
+    rows = zip(motion.theta.tolist(), motion.tau.tolist(), motion.q.tolist(), strict=True)
     for k, (theta, tau, q) in enumerate(rows):
-        estimator.step(Sample(k, theta, nothing, tau, q))
+        estimator.step(Sample(k, tuple(theta), nothing, tuple(tau), q))
         estimated = estimator.external
         assert estimated is not None
         torque[k], status[k] = estimated.external_torque_nm, estimated.status
-    valid = status & int(ExternalStatus.VALID) > 0
-    return torque, valid, status & int(ExternalStatus.CONTACT) > 0
+    return torque, status & int(ExternalStatus.VALID) > 0, status & int(ExternalStatus.CONTACT) > 0
 
 
 def link_side(model: JointModel, q: np.ndarray) -> np.ndarray:
@@ -275,11 +240,11 @@ def rigid(model: JointModel, motion: Motion, compensated: bool) -> np.ndarray:
     return total
 
 
-def nominal(rig: JointUnderTest, model: JointModel, motion: Motion) -> np.ndarray:
+def nominal(model: JointModel, motion: Motion) -> np.ndarray:
     """The link's momentum and a data sheet's springs."""
     F = StateVariableFilter(3, BANDWIDTH, T)
     total = link_side(model, motion.q)
-    for i, motor in enumerate(rig.plant.motors):
+    for i, motor in enumerate(motion.motors):
         law = motor.law()
         phi = motion.q - motion.theta[:, i]
         (torque,) = F.apply(NOMINAL * np.array([law.torque(x) for x in phi.tolist()]))
@@ -287,11 +252,8 @@ def nominal(rig: JointUnderTest, model: JointModel, motion: Motion) -> np.ndarra
     return total
 
 
-def judge(
-    rig: JointUnderTest, estimated: np.ndarray, contact: np.ndarray, motion: Motion, seed: int
-) -> dict[str, float]:
-    """Error where a value is valid (else NaN), smallest push, delay."""
-    g = rig.plant.link.gravity_nm
+def judge(g: float, estimated: np.ndarray, contact: np.ndarray, seed: int) -> dict[str, float]:
+    """Error where a value is valid (else NaN), smallest push, delay; gravity g in N·m."""
     errors, delays = [], []
     found: dict[float, list[bool]] = {size: [] for size in LADDER}
     for begin, size in zip(*pushes(g, seed), strict=True):
@@ -322,43 +284,34 @@ def judge(
 
 def measure(name: str, minutes: float, errors: list[float], seed: int = 1) -> list[dict[str, Any]]:
     """The rows of one joint."""
-    rig = RIGS[name]()
-    free = simulate(rig, LEARN_S + 60.0 * minutes, seed, pushed=False)
-    length_s = LEARN_S + EVERY_S * (len(LADDER) * EACH + 1)
-    motion = simulate(rig, length_s, seed + 1, pushed=True)
+    title, text = RIGS[name]
+    joint = parse(text)
+    assert joint.link.dynamics is not None
+    g = joint.link.dynamics.gravity_nm
+    free = simulate(joint, LEARN_S + 60.0 * minutes, seed, pushed=False)
+    motion = simulate(joint, LEARN_S + EVERY_S * (len(LADDER) * EACH + 1), seed + 1, pushed=True)
     rows: list[dict[str, Any]] = []
     after = slice(round(LEARN_S / T), None)
     for error in errors:
-        model = rig.model(0.01 * error)
+        model = declared(joint, 0.01 * error)
         torque, valid, contact = ours(model, free)
         pushed, sound, touched = ours(model, motion)
-        own = {
+        pushed = np.where(sound, pushed, np.nan)
+        methods: dict[str, dict[str, Any]] = {"drivelink": judge(g, pushed, touched, seed + 1)}
+        methods["drivelink"] |= {
             "valid": float(np.mean(valid[after])),
             "alarms": int(np.count_nonzero(np.diff(contact[after].astype(int)) > 0)),
         }
-        both: dict[str, tuple[np.ndarray, np.ndarray]] = {
-            "drivelink, threshold": (np.where(valid, torque, np.nan), np.where(sound, pushed, np.nan)),
-            "rigid": (rigid(model, free, False), rigid(model, motion, False)),
-            "rigid, friction": (rigid(model, free, True), rigid(model, motion, True)),
-            "nominal spring": (nominal(rig, model, free), nominal(rig, model, motion)),
-        }
-        methods: dict[str, dict[str, Any]] = {
-            "drivelink": own | judge(rig, np.where(sound, pushed, np.nan), touched, motion, seed + 1)
-        }
-        for method, (quiet, estimated) in both.items():
+        for method, quiet, estimated in (
+            ("drivelink, threshold", np.where(valid, torque, np.nan), pushed),
+            ("rigid", rigid(model, free, False), rigid(model, motion, False)),
+            ("rigid, friction", rigid(model, free, True), rigid(model, motion, True)),
+            ("nominal spring", nominal(model, free), nominal(model, motion)),
+        ):
             threshold = float(np.nanmax(np.abs(quiet[after])))
-            methods[method] = judge(rig, estimated, np.abs(estimated) > threshold, motion, seed + 1)
-        rows += [
-            {
-                "joint": rig.title,
-                "error_percent": error,
-                "method": method,
-                "alarms": None,
-                "valid": None,
-                **values,
-            }
-            for method, values in methods.items()
-        ]
+            methods[method] = judge(g, estimated, np.abs(estimated) > threshold, seed + 1)
+        common = {"joint": title, "error_percent": error, "alarms": None, "valid": None}
+        rows += [common | {"method": method, **values} for method, values in methods.items()]
     return rows
 
 

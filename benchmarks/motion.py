@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scene
-from undeclared import World, simulate
+from world import World, simulate
 
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.diagnosis.motion import design

@@ -26,7 +26,7 @@ from drivelink import jointfile, recording
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.apply_diagnosis import diagnosed_model
 from drivelink.output import report
-from estimator import EstimatorSettings, ExternalStatus, LinkDynamics, Sample, Status, make_estimator
+from estimator import EstimatorSettings, ExternalStatus, LinkDynamics, Status, make_estimator
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.frame import Corrections, Frame, Signals
 from estimator.filters import StateVariableFilter
@@ -129,14 +129,7 @@ def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> 
     estimator = make_estimator(behind, EstimatorSettings(), record.period_s)
     assert record.link_position_rad is not None
     said, external = [], []
-    for n, theta, tau, q in zip(
-        record.sequence, record.motor_position_rad[:, 0], record.motor_torque_nm[:, 0],
-        record.link_position_rad, strict=True,
-    ):  # fmt: skip
-        sample = Sample(
-            sequence=int(n), motor_position_rad=(float(theta),), motor_velocity_rad_s=(np.nan,),
-            motor_torque_nm=(float(tau),), link_position_rad=float(q),
-        )  # fmt: skip
+    for sample in record.samples():
         said.append(estimator.step(sample))
         reported = estimator.external
         external.append(reported.external_torque_nm if reported.status & ExternalStatus.VALID else np.nan)

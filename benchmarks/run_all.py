@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 import tempfile
@@ -21,15 +22,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import can
-import numpy as np
-
 HERE = Path(__file__).parent
 TIMEOUT_S = 7200  # of a section: the longest takes a quarter of an hour on two quiet cores
 
 
 class Section(NamedTuple):
-    """Title; arguments, all and where minutes count; the program, where several sections share one."""
+    """Title; arguments, and those where minutes count; the program, where several sections share one."""
 
     title: str
     full: str = ""
@@ -43,22 +41,30 @@ SECTIONS = {
     "service": Section("Jitter, recorder, start, memory", quick="--seconds 2 --rounds 1"),
     "estimator_tick": Section("The estimator alone", quick="--ticks 8000"),
     "paper_table": Section("The paper's table"),
-    "ensembles": Section("The estimator on random joints", quick="--joints 1"),
-    "undeclared": Section("Effects that nobody declared, on an independent simulator", quick="--joints 1"),
-    "ekf": Section("An extended Kalman filter beside ours", "--joints 6", "--joints 1 --cases linear"),
+    "ensembles": Section("The estimator on random joints", quick="--joints 1", of="estimators"),
+    "undeclared": Section(
+        "Effects that nobody declared, on an independent simulator",
+        "--undeclared --seconds 30",
+        "--joints 1",
+        of="estimators",
+    ),
+    "ekf": Section(
+        "An extended Kalman filter on the same joints",
+        "--mode ekf --joints 6",
+        "--cases linear",
+        of="estimators",
+    ),
     "diagnosis_seeds": Section(
-        "Diagnosis on published seeds", "--seeds 1", "--seeds 1 --effects clean,coulomb_friction,backlash"
+        "Diagnosis on published seeds", "--seeds 1", "--effects clean,coulomb_friction,backlash"
     ),
-    "effect_pairs": Section(
-        "Two effects at once", "--pairs --seeds 1", "--pairs --seeds 1 --seconds 10", of="diagnosis_seeds"
-    ),
+    "effect_pairs": Section("Two effects at once", "--pairs --seeds 1", "--seconds 10", of="diagnosis_seeds"),
     "motion": Section("What to move next: designed and random motions", quick="--recordings 1"),
     "loop": Section(
         "The loop that closes itself, on each effect", quick="--effects coulomb_friction,backlash"
     ),
-    "gate": Section("Wrong units, signs, gears and time", "--seeds 2", "--seeds 1 --kinds serial"),
+    "gate": Section("Wrong units, signs, gears and time", "--seeds 2", "--kinds serial"),
     "real_data": Section("Real data before and after"),
-    "constants": Section("Choice constants halved and doubled", "--report", "--report"),
+    "constants": Section("Choice constants halved and doubled", "--report"),
     "external": Section("External torque and contact", quick="--minutes 2 --errors 2 --joints sea"),
     "fault_matrix": Section(
         "Sensor faults: wrong samples called valid", quick="--joints constant --seconds 8"
@@ -66,7 +72,7 @@ SECTIONS = {
     "fault_sizes": Section(
         "Sensor faults: sizes up to which nothing is noticed",
         "--sizes --joints constant,vsa-ii",
-        "--sizes --joints constant",
+        "--joints constant",
         of="fault_matrix",
     ),
     "soak": Section("Ten minutes of random faults in real time", quick="--seconds 60"),
@@ -76,69 +82,44 @@ SECTIONS = {
 
 def machine() -> dict[str, Any]:
     """What numbers are taken on."""
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = [
-            line.partition(":")[2].strip()
-            for line in cpuinfo.read_text().splitlines()
-            if "model name" in line
-        ]
-        model = names[0] if names else model
+    names = re.findall(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     return {
-        "processor": model,
+        "processor": names[0] if names else platform.machine(),
         "cores": os.cpu_count(),
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
-        "numpy": np.__version__,
-        "python-can": can.__version__,
-        "zenoh": version("eclipse-zenoh"),
+        **{name: version(name) for name in ("numpy", "python-can", "eclipse-zenoh")},
     }
 
 
 def run(name: str, quick: bool) -> dict[str, Any]:
     """Run a section; what it printed, its numbers, or why there are none."""
     section = SECTIONS[name]
-    path = HERE / f"{section.of or name}.py"
+    program = f"{section.of or name}.py"
+    arguments = f"{section.full} {section.quick if quick else ''}".split()
+    start = time.monotonic()
     result: dict[str, Any] = {
         "title": section.title,
         "machine": machine(),
         "at": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         "load": os.getloadavg()[0],
+        "command": " ".join(["python", f"benchmarks/{program}", *arguments]),
     }
-    arguments = (section.quick if quick else section.full).split()
-    start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         numbers = Path(folder) / "numbers.json"
-        extra = ["--json", str(numbers)]
-        done = execute([sys.executable, str(path), *arguments, *extra], folder)
-        result["command"] = " ".join(["python", f"benchmarks/{path.name}", *arguments])
+        command = ["timeout", str(TIMEOUT_S), sys.executable, HERE / program, *arguments, "--json", numbers]
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+        done = subprocess.run(
+            command, capture_output=True, text=True, cwd=folder, env=environment, check=False
+        )
         result["took_s"] = round(time.monotonic() - start, 1)
         if done.returncode != 0:
             lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
             return {**result, "skipped": lines[-1]}
         result["text"] = done.stdout.rstrip()
-        result["markdown"] = result["text"].startswith("|")
         if numbers.exists():
             result["numbers"] = json.loads(numbers.read_text(encoding="utf-8"))
     return result
-
-
-def execute(command: list[str], folder: str) -> subprocess.CompletedProcess[str]:
-    """Run a program, in a folder it may write to."""
-    environment = {**os.environ, "COLUMNS": "150", "OPENBLAS_NUM_THREADS": "1"}
-    try:
-        return subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
-            cwd=folder,
-            env=environment,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return subprocess.CompletedProcess(command, 1, "", f"not done after {TIMEOUT_S} s")
 
 
 def document(results: dict[str, Any]) -> str:
@@ -153,14 +134,14 @@ def document(results: dict[str, Any]) -> str:
         if "skipped" in result:
             lines.append(f"Left out: `{name}`: {result['skipped']}")
             continue
-        lines.append(
+        lines += [
             f"`{result['command']}`, {result['at']}, {result['took_s']:.0f} s, "
-            f"load of the machine before: {result['load']:.1f}."
-        )
-        if "machine" in result:
-            lines += ["", ", ".join(f"{name} {value}" for name, value in result["machine"].items()) + "."]
-        text = result["text"]
-        lines += ["", text if result["markdown"] else f"```\n{text}\n```"]
+            f"load of the machine before: {result['load']:.1f}.",
+            "",
+            ", ".join(f"{name} {value}" for name, value in result["machine"].items()) + ".",
+            "",
+            result["text"] if result["text"].startswith("|") else f"```\n{result['text']}\n```",
+        ]
     return "\n".join(lines) + "\n"
 
 

@@ -1,19 +1,16 @@
 """What each stage of a cycle costs as joints are added, and how many joints one core carries.
 
-    python benchmarks/stages.py [--cycles N] [--joints N] [--ticks N]
+    python benchmarks/stages.py [--cycles N] [--joints N]
 
 Recorded frames of the simulated devices are laid into the queues of virtual buses; then the daemon's own
 parts take them, at 1 kHz in one thread with real-time scheduling where the system allows, and publish to a
 subscriber in another process. CPU of the thread, by stage; CPU of the whole process a cycle, with zenoh's
 threads and the sleeping, without the laying of frames. The floor receives, unpacks and puts the same bytes.
-With --ticks instead, the memory that the pipeline of a two-motor joint takes as so many cycles go through it.
 """
 
 from __future__ import annotations
 
-import resource
 import statistics
-import sys
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -173,29 +170,6 @@ def flat_out(parts: list[Clocked], recorded: Cycles) -> float:
     return len(recorded) / cpu_s
 
 
-def resident_bytes() -> int:
-    """Memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * resource.getpagesize()
-
-
-def memory(ticks: int) -> scene.Row:
-    """Growth over so many cycles of a two-motor joint, frames to bytes, after a tenth of them."""
-    which = joint("robust", free_endpoint(), motors=2)
-    recorded, layouts = frames_of(which, 5000)
-    cycles = [[(frame.arbitration_id, bytes(frame.data)) for frame in frames] for frames in recorded]
-    pipeline = make_pipeline(which, tuple(layouts.values()))
-    start = 0
-    for k in range(ticks):
-        if k == ticks // 10:
-            start = resident_bytes()
-        pipeline.feed(SYNC_COB_ID, b"")
-        for cob_id, data in cycles[k % len(cycles)]:
-            tick = pipeline.feed(cob_id, data)
-        assert tick is not None and tick.estimate_payload
-    return {"ticks": ticks, "growth_kib": (resident_bytes() - start) / 1024}
-
-
 def measure(cycles: int, most: int) -> Iterator[scene.Row]:
     """One row a number of joints, up to `most`."""
     recordings = {
@@ -221,21 +195,18 @@ def measure(cycles: int, most: int) -> Iterator[scene.Row]:
 
 
 def rows(args: Any) -> Iterator[scene.Row]:
-    """One row a number of joints; with --ticks the memory only."""
-    return iter([memory(args.ticks)]) if args.ticks else measure(args.cycles, args.joints)
+    """One row a number of joints."""
+    return measure(args.cycles, args.joints)
 
 
 def carried(found: list[scene.Row]) -> str:
     """VSA joints that one core carries at 1 kHz, from what the last ones added cost."""
-    if "joints" not in found[0]:
-        return ""
     one, many = (next(r for r in found if (r["joints"], r["motors"]) == at) for at in ((1, 2), (4, 8)))
     each = (many["process_us_per_cycle"] - one["process_us_per_cycle"]) / (many["joints"] - one["joints"])
     most = 1 + (1e6 * PERIOD_S - one["process_us_per_cycle"]) / each
     return f"CPU in µs. At 1 kHz one core carries {most:.1f} VSA joints (process, computed)."
 
 
-MEMORY = {"cycles": "{ticks:.2g}", "memory grows by / KiB": "{growth_kib:+.0f}"}
 COLUMNS = {
     "joints": "{joints}",
     "motors": "{motors}",
@@ -251,9 +222,8 @@ if __name__ == "__main__":
     scene.main(
         __doc__,
         rows,
-        MEMORY if "--ticks" in sys.argv else COLUMNS,
+        COLUMNS,
         scene.Option("--cycles", 5000),
         scene.Option("--joints", 16, "at most (at least 4)"),
-        scene.Option("--ticks", 0, "memory over so many cycles instead"),
         after=carried,
     )

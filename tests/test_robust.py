@@ -58,7 +58,7 @@ def test_stiffness_is_right_along_the_motion_declared_parameters_exact_or_not(ri
     assert min(usable) > 0.4
     # Asked for: 0.1 % median, 0.3 % worst after convergence; here the first seconds count, too.
     assert np.median(errors) < 1.5e-3 and max(errors) < 4e-3
-    # Six joints are six draws, each slow to change: 95 % of them on average needs many more draws (benchmarks/ensembles.py).
+    # Six joints are six draws, each slow to change: 95 % of them on average needs many more draws (benchmarks/estimators.py).
     assert np.mean(inside) > 0.85
 
 

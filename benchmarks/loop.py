@@ -21,7 +21,7 @@ import scene
 from diagnosis_seeds import LIKELY, sizes
 
 from drivelink import jointfile
-from drivelink.cycle.loop import ObjectSink
+from drivelink._core import Tick
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import alter, network_from_joint, world_from_joint
@@ -32,7 +32,7 @@ from drivelink.loop.finding import proposal_file, recording_name
 from drivelink.recording.sinks import McapSink
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
-from estimator.sample import Estimate, Sample, Status
+from estimator.sample import Sample, Status
 from sim.effects import LISTED
 
 ELBOW = Path(__file__).parent.parent / "drivelink" / "joints" / "elbow.toml"
@@ -40,18 +40,17 @@ HEALTHY_S, PATIENCE_S, WATCHED_S = 10.0, 45.0, 10.0
 TORQUE_NM, STIFFNESS_NM_RAD = 5.0, 120.0  # rms of the motion, stiffness at rest
 
 
-class Taken(ObjectSink):
+class Taken:
     """Samples and alarm of every cycle."""
 
     def __init__(self) -> None:
         self.samples: list[Sample] = []
         self.alarm = False
 
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        self.alarm = self.alarm or bool(estimate.status & Status.MODEL_ALARM)
-
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        self.samples.append(sample)
+    def put(self, tick: Tick) -> None:
+        self.alarm = self.alarm or bool(tick.estimate.status & Status.MODEL_ALARM)
+        if tick.sample is not None:
+            self.samples.append(tick.sample)
 
 
 def effect_text(name: str, share: float) -> str:

@@ -87,7 +87,6 @@ class Assembler:
         sequence: number of the current SYNC, from 0; -1 before the first.
         missed: number of the cycle the last SYNC closed without a sample, or -1 if it had one.
         flags: service bits of `Status` that hold for the sample just given, or the cycle just missed.
-        extra_syncs: SYNCs that were not due: another master makes them, or a frame is repeated.
         cob_ids: identifiers that concern this joint, SYNC aside.
         counters: by node id, as they are now.
         faults: nodes that report a fault, with the EMCY error code (0: by statusword only).
@@ -119,8 +118,6 @@ class Assembler:
     @property
     def flags(self) -> int: ...
     @property
-    def extra_syncs(self) -> int: ...
-    @property
     def cob_ids(self) -> tuple[int, ...]: ...
     @property
     def counters(self) -> dict[int, NodeCounters]: ...
@@ -136,9 +133,6 @@ class Assembler:
     def has_link(self) -> bool: ...
     @property
     def complete(self) -> bool: ...
-    def missing_nodes(self) -> tuple[int, ...]:
-        """Nodes that the current cycle still waits for."""
-
     def feed(self, cob_id: int, data: bytes, jump: int = 1) -> Sample | None:
         """Take one frame in the order of the bus, SYNC included; the sample that it completes, if it does.
 
@@ -173,13 +167,10 @@ class LatencyHistogram:
 
     Attributes:
         count: durations since the start.
-        maximum_us: the longest of them, in whole microseconds.
     """
 
     @property
     def count(self) -> int: ...
-    @property
-    def maximum_us(self) -> int: ...
     def add(self, duration_ns: int) -> None:
         """Count one duration."""
 

@@ -11,28 +11,25 @@ from pathlib import Path
 
 import drivelink
 from drivelink import jointfile
+from drivelink._core import Tick
 from drivelink.canopen.bus import open_bus
-from drivelink.cycle.loop import ObjectSink
-from drivelink.cycle.startup import run_lockstep
+from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.recording.formats import open_sink
-from estimator.sample import Estimate, Sample
 
 JOINT = Path(__file__).parent / "vsa-ii.toml"
 FRICTION_NM = 0.004
 
 
-class Recorder(ObjectSink):
-    """Takes what the daemon would publish, and writes the samples to a CSV file."""
+class Recorder:
+    """Take what the daemon would publish, and write the samples to a CSV file."""
 
     def __init__(self, path: Path) -> None:
         self.file = open_sink(path, jointfile.load(JOINT))
 
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        self.file.sample(sample, stamp_ns)
-
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        pass
+    def put(self, tick: Tick) -> None:
+        if tick.sample is not None:
+            self.file.sample(tick.sample, tick.stamp_ns)
 
 
 def record(path: Path, seconds: float, *effects: str, run: int = 0) -> None:
@@ -45,12 +42,10 @@ def record(path: Path, seconds: float, *effects: str, run: int = 0) -> None:
     path.unlink(missing_ok=True)
     recorder = Recorder(path)
     with open_bus(joint.bus) as bus:
-        run_lockstep(
-            joint,
-            network_from_joint(joint, bus, world=world),
-            recorder,
-            round(seconds / joint.bus.period_s),
-        )
+        devices = network_from_joint(joint, bus, world=world).poll
+        with Daemon([ServedJoint(joint=joint)], publish=False, real_time=False, devices=devices) as daemon:
+            daemon.loop.loop_joints[0].sink = recorder
+            daemon.run_lockstep(round(seconds / joint.bus.period_s))
     recorder.file.close()
 
 

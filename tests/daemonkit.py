@@ -13,7 +13,6 @@ from can.interfaces import virtual
 from zenohkit import LIMIT_S, until
 
 from drivelink._core import Tick
-from drivelink.cycle.loop import ObjectSink
 from drivelink.cycle.startup import join_bus
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
@@ -79,7 +78,7 @@ def vsa(**options: str) -> JointFile:
     return parse(vsa_text(**options))
 
 
-class Collector(ObjectSink):
+class Collector:
     """A sink that keeps everything."""
 
     def __init__(self) -> None:
@@ -89,13 +88,9 @@ class Collector(ObjectSink):
 
     def put(self, tick: Tick) -> None:
         self.payloads.append((tick.estimate_payload, tick.sample_payload))
-        super().put(tick)
-
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        self.estimates.append((estimate, stamp_ns))
-
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        self.samples.append((sample, stamp_ns))
+        self.estimates.append((tick.estimate, tick.stamp_ns))
+        if tick.sample is not None:
+            self.samples.append((tick.sample, tick.stamp_ns))
 
 
 class DaemonRig:

@@ -12,11 +12,11 @@ import can
 from daemonkit import vsa_text
 from fuzzbus import MIXES, FuzzBus
 
-from drivelink._core import Assembler, JointPipeline
+from drivelink._core import Assembler, JointPipeline, Tick
 from drivelink.canopen.configure import configure_joints
 from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.loop import CycleLoop, LoopJoint, ObjectSink
+from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.pipeline import build
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
@@ -79,21 +79,20 @@ class _Port:
         self._bus.send_message(msg)
 
 
-class _Judge(ObjectSink):
+class _Judge:
     """The sink: holds every VALID sample against what the nodes measured at its SYNC."""
 
     def __init__(self, run: FuzzRun) -> None:
         self._run = run
         self.valid = self.samples = self.unknowable = 0
 
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+    def put(self, tick: Tick) -> None:
+        estimate, sample = tick.estimate, tick.sample
         if estimate.status & Status.VALID and estimate.status & Status.STALE:
             raise WrongValidError(f"VALID and STALE: {estimate}")
-
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
+        if sample is None:
+            return
         self.samples += 1
-        estimate = self._run.pipeline.estimate
-        assert estimate is not None
         if not estimate.status & Status.VALID:
             return
         self.valid += 1

@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 
 from drivelink import cli, jointfile
-from drivelink.cycle.loop import ObjectSink
-from drivelink.cycle.startup import run_lockstep
+from drivelink._core import Tick
+from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.jointfile import JointFile
 from estimator.model_monitor import ModelMonitor
-from estimator.sample import Estimate, FloatArray, Sample, Status
+from estimator.sample import FloatArray, Status
 
 _channels = itertools.count()
 
@@ -63,23 +63,19 @@ START_S = 1_700_000_000
 CALIBRATION, SUSPECT, CHECK = 1, 2, 3  # three motions: what is judged live is not what was recorded
 
 
-class Live(ObjectSink):
+class Live:
     """A sink that watches from outside, with a monitor that only measures."""
 
     def __init__(self, joint: JointFile) -> None:
         self._monitor = ModelMonitor(joint.model(), joint.bus.period_s, None)
-        self._estimate: Estimate | None = None
         self._residuals: list[tuple[float, ...]] = []
         self._alarms: list[bool] = []
 
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        self._estimate = estimate
-        self._alarms.append(bool(estimate.status & Status.MODEL_ALARM))
-
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        assert self._estimate is not None
-        self._monitor.step(sample, self._estimate, math.nan)
-        self._residuals.append(self._monitor.residual_nm)
+    def put(self, tick: Tick) -> None:
+        self._alarms.append(bool(tick.estimate.status & Status.MODEL_ALARM))
+        if tick.sample is not None:
+            self._monitor.step(tick.sample, tick.estimate, math.nan)
+            self._residuals.append(self._monitor.residual_nm)
 
     def residual_nm(self) -> FloatArray:
         """Mean over the second half of the run of each balance's residual: the motor's, then the link's."""
@@ -101,21 +97,22 @@ def run(path: Path, motion: int, effects: tuple[str, ...] = (), log: Path | None
     writer = can.CanutilsLogWriter(log) if log else None
     network = network_from_joint(world, bus, world=world_from_joint(world, effects=effects))
 
-    class Devices:
-        """The simulated devices, and a recorder that stamps by the SYNC, as there is no other time here."""
+    cycle = 0
 
-        cycle = 0
-
-        def poll(self) -> int:
-            handled = network.poll()
-            while writer is not None and (message := tap.recv(0)) is not None:
-                self.cycle += message.arbitration_id == 0x080
-                message.timestamp = START_S + self.cycle * joint.bus.period_s
-                writer.on_message_received(message)
-            return handled
+    def poll() -> int:
+        """Let the devices answer; record by the stamps of SYNC, as there is no other time here."""
+        nonlocal cycle
+        handled = network.poll()
+        while writer is not None and (message := tap.recv(0)) is not None:
+            cycle += message.arbitration_id == 0x080
+            message.timestamp = START_S + cycle * joint.bus.period_s
+            writer.on_message_received(message)
+        return handled
 
     try:
-        run_lockstep(joint, Devices(), live, CYCLES, start_ns=START_S * 1_000_000_000)
+        with Daemon([ServedJoint(joint=joint)], publish=False, real_time=False, devices=poll) as daemon:
+            daemon.loop.loop_joints[0].sink = live
+            daemon.loop.run_lockstep(CYCLES, START_S * 1_000_000_000)
     finally:
         bus.shutdown()
         tap.shutdown()

@@ -16,7 +16,7 @@ from zenohkit import free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.cycle.pipeline import make_pipeline
-from drivelink.cycle.startup import join_bus, run_lockstep
+from drivelink.cycle.startup import join_bus
 from drivelink.daemon import reload
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
@@ -336,16 +336,6 @@ def test_two_joints_share_a_bus_and_its_sync() -> None:
         assert {pipeline.estimate.sequence for pipeline in made.pipelines} == {599}
         assert [len(pipeline.estimate.transmissions) for pipeline in made.pipelines] == [2, 1]
         assert first["bus"]["load"] == second["bus"]["load"] > 0.3
-
-
-def test_lockstep_is_the_same_cycle_without_the_daemon_around_it() -> None:
-    joint, truth = vsa(), []
-    bus = open_sim_bus(joint.bus)
-    network = network_from_joint(joint, bus)
-    loop_joint = run_lockstep(joint, network, None, 400, each=lambda: truth.append(network.syncs))
-    assert (loop_joint.estimates, loop_joint.pipeline.missed) == (400, 0)
-    assert truth == list(range(1, 401))
-    bus.shutdown()
 
 
 class Broken:

@@ -15,7 +15,7 @@ from rich.console import Console
 from zenohkit import LIMIT_S, until
 
 from drivelink import jointfile
-from drivelink.cycle.loop import ObjectSink
+from drivelink._core import Tick
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.closedloop import STEPS
 from drivelink.demo.closing import Comparison, as_json, closing_table
@@ -24,7 +24,7 @@ from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.monitor.history import TruePoint
 from drivelink.pubsub.wire import EstimateMessage
-from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+from estimator.sample import Status, TransmissionEstimate
 
 DEMO = [sys.executable, "-m", "drivelink", "demo"]
 
@@ -34,17 +34,14 @@ def message(sequence: int, torque: float, stiffness: float, *, status: int = Sta
     return EstimateMessage(sequence, 0, int(status), torque, stiffness, 1.0, (each,))
 
 
-class Statuses(ObjectSink):
+class Statuses:
     """A sink that keeps each status."""
 
     def __init__(self) -> None:
         self.seen: list[int] = []
 
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        self.seen.append(estimate.status)
-
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        pass
+    def put(self, tick: Tick) -> None:
+        self.seen.append(tick.estimate.status)
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from canlayouts import VSA, vsa_cycle
 
-from drivelink._core import Assembler, JointPipeline
+from drivelink._core import Assembler, JointPipeline, Tick
 from drivelink.cycle import realtime
 from drivelink.cycle.housekeeping import Housekeeping
-from drivelink.cycle.loop import CycleLoop, LoopJoint, ObjectSink
+from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.sources import CanFrame
 from drivelink.systemd import unit
 from drivelink.systemd.unit import Watchdog, notify, watchdog_period_s
@@ -105,19 +105,16 @@ class Last:
         return None
 
 
-class Stamps(ObjectSink):
+class Stamps:
     def __init__(self, stop_after: int) -> None:
         self.stop_after = stop_after
         self.seen: list[tuple[int, int]] = []
         self.loop: CycleLoop | None = None
 
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        self.seen.append((estimate.sequence, stamp_ns))
+    def put(self, tick: Tick) -> None:
+        self.seen.append((tick.estimate.sequence, tick.stamp_ns))
         if len(self.seen) >= self.stop_after and self.loop is not None:
             self.loop.stop()
-
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        pass
 
 
 def test_deadlines_move_by_whole_periods_and_late_cycles_are_left_out_as_gaps() -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -18,7 +17,6 @@ from drivelink._core import LATE, SYNC_COB_ID, JointPipeline, LatencyHistogram, 
 from drivelink.cycle.housekeeping import Housekeeping
 from drivelink.cycle.sources import BusLostError, CanFrame, FrameSource, LostSource
 from drivelink.cycle.syncclock import MEASURED_SYNCS, SyncClock
-from estimator.sample import Estimate, Sample
 
 logger = logging.getLogger(__name__)
 
@@ -33,25 +31,6 @@ class CycleSink(Protocol):
 
     def put(self, tick: Tick) -> None:
         """Publish a cycle: its estimate, then its sample, if any."""
-
-
-class ObjectSink(ABC):
-    """A sink that takes Python objects instead of the bytes for zenoh."""
-
-    def put(self, tick: Tick) -> None:
-        """See `CycleSink`."""
-        self.put_estimate(tick.estimate, tick.stamp_ns)
-        sample = tick.sample
-        if sample is not None:
-            self.put_sample(sample, tick.stamp_ns)
-
-    @abstractmethod
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        """Take an estimate and the UNIX time of its SYNC."""
-
-    @abstractmethod
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        """Take what it was made from."""
 
 
 class LoopJoint:

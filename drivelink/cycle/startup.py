@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import can
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.bus import Idle, frames, is_canopen, open_bus
+from drivelink.canopen.bus import Idle, frames, is_canopen
 from drivelink.canopen.configure import Configurator, configure_joints, refuse_foreign_sync
 from drivelink.canopen.layout import NodeLayout, roles
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.loop import CycleLoop, CycleSink, LoopJoint
-from drivelink.cycle.pipeline import make_pipeline
-from drivelink.cycle.sources import open_source
+from drivelink.cycle.loop import CycleLoop
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile
@@ -199,58 +196,3 @@ def _await(
     if not expected.met:
         raise expected.failure(patience_s)
     return stamps
-
-
-class Devices(Protocol):
-    """Simulated devices on the joint's bus (`sim.network.Network`)."""
-
-    def poll(self) -> int:
-        """Handle what has been sent."""
-
-
-def run_lockstep(
-    joint: JointFile,
-    devices: Devices,
-    sink: CycleSink | None,
-    cycles: int,
-    *,
-    folder: Path = Path(),
-    start_ns: int = 0,
-    each: Callable[[], object] | None = None,
-) -> LoopJoint:
-    """Configure the devices, then run so many cycles of the daemon's loop.
-
-    Args:
-        joint: on the virtual bus of the devices.
-        devices: polled in this thread; SYNC advances their world by one period.
-        sink: gets estimates and samples, e.g. a `JointPublisher`; None: only the loop_joint counts them.
-        start_ns: UNIX time that the first SYNC is stamped with.
-        each: called after every cycle, e.g. to look at the truth.
-
-    Returns:
-        The loop_joint, with its pipeline and counters.
-
-    Raises:
-        DriveError, BusError: as the daemon's start does.
-    """
-    bus = open_bus(joint.bus)
-    try:
-        port = BusPort(bus)
-        _, layouts = join_bus(port, [joint], [folder], idle=devices.poll)
-        loop_joint = LoopJoint(joint.name, make_pipeline(joint, layouts[0]), sink)
-        loop = CycleLoop(
-            open_source(bus, devices.poll),
-            [loop_joint],
-            period_s=joint.bus.period_s,
-            counter_overflow=joint.bus.sync_counter_overflow,
-            world_steps=True,
-        )
-        if each is None:
-            loop.run_lockstep(cycles, start_ns)
-        else:
-            for stamp_ns in loop.stamps(cycles, start_ns):
-                loop.run_lockstep(1, stamp_ns)
-                each()
-        return loop_joint
-    finally:
-        bus.shutdown()

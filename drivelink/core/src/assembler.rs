@@ -73,8 +73,6 @@ pub struct Assembler {
     pub missed: Option<i64>,
     /// Service bits of the status that hold for the sample just given, or the cycle just missed.
     pub flags: u32,
-    /// SYNCs that were not due: another master makes them, or a frame is repeated.
-    pub extra_syncs: u64,
 }
 
 impl Assembler {
@@ -123,7 +121,6 @@ impl Assembler {
             sequence: -1,
             missed: None,
             flags: 0,
-            extra_syncs: 0,
         };
         for layout in layouts {
             if !assembler.nodes.iter().any(|node| node.node_id == layout.node_id) {
@@ -172,14 +169,6 @@ impl Assembler {
     #[must_use]
     pub fn complete(&self) -> bool {
         !self.open
-    }
-
-    /// Nodes that the current cycle still waits for, some of them twice.
-    pub fn missing_nodes(&self) -> impl Iterator<Item = u32> + '_ {
-        self.decoders
-            .iter()
-            .filter(|decoder| decoder.timed() && !decoder.arrived)
-            .map(|decoder| self.nodes[decoder.node].node_id)
     }
 
     /// Take one frame in the order of the bus, SYNC included; the sample that it completes, if it does.
@@ -232,7 +221,6 @@ impl Assembler {
             return self.open_unnumbered();
         }
         if jump <= 0 {
-            self.extra_syncs += 1;
             self.spoiled = true; // what comes now answers that SYNC or ours: unknowable
             self.untimed = DOUBT_CYCLES;
             for decoder in self.decoders.iter_mut().filter(|decoder| decoder.timed()) {
@@ -650,7 +638,6 @@ mod tests {
         let mut made = assembler();
         assert_eq!(made.cob_ids().filter(|id| [0x181, 0x183].contains(id)).count(), 2);
         assert!(made.has_link() && made.feed(SYNC_COB_ID, &[], 1).is_none());
-        assert_eq!(made.missing_nodes().collect::<Vec<_>>(), [1, 3]);
         assert!(made.feed(0x181, &drive(-1500, 20), 0).is_none());
         let sample = made.feed(0x183, &250i32.to_le_bytes(), 0).unwrap();
         assert_eq!((sample.sequence, sample.motor_position[0], sample.link_position), (0, -1.5, 0.25));

@@ -78,11 +78,6 @@ impl Assembler {
     }
 
     #[getter]
-    fn extra_syncs(&self) -> u64 {
-        lock(&self.core).extra_syncs
-    }
-
-    #[getter]
     fn cob_ids<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
         let cob_ids: Vec<u32> = lock(&self.core).cob_ids().collect();
         PyTuple::new(py, cob_ids)
@@ -147,12 +142,6 @@ impl Assembler {
     #[getter]
     fn complete(&self) -> bool {
         lock(&self.core).complete()
-    }
-
-    fn missing_nodes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
-        let mut nodes: Vec<u32> = lock(&self.core).missing_nodes().collect();
-        nodes.dedup();
-        PyTuple::new(py, nodes)
     }
 
     #[pyo3(signature = (cob_id, data, jump = 1))]

@@ -37,11 +37,6 @@ impl LatencyHistogram {
         lock(&self.core).count
     }
 
-    #[getter]
-    fn maximum_us(&self) -> u64 {
-        lock(&self.core).maximum_us
-    }
-
     fn add(&self, duration_ns: i64) {
         lock(&self.core).add(duration_ns);
     }

@@ -8,8 +8,8 @@ one after the other, with a calm stretch between them, at the end of which the d
 With --two another one begins during that share of them; with --recount the encoder counts from elsewhere
 after that share of reboots. Beside every VALID estimate stands the truth: its values are of its SYNC,
 stiffness and torque are right by the rules of the fault matrix. What is not is an episode, told with its
-seed. With --lockstep time is the number of cycles: the same faults on a machine that has other things to
-do. Memory is the resident set after a collection, with the C library's allocator alone, so that what is
+seed; so is a daemon that is not well again, after which another one begins. With --lockstep time is the
+number of cycles: the same faults on a machine that has other things to do. Memory is the resident set after a collection, with the C library's allocator alone, so that what is
 freed is seen to be (Python's own keeps it); threads are counted. Both must be flat once the first minute,
 in which buffers fill, is over: medians of the first and the last third are compared.
 """
@@ -50,6 +50,7 @@ FLAT_KB = (
 )
 FLAT_OBJECTS = 2000  # what is made once, at the first fault of a kind; a leak of one a cycle would be 400 000
 COUNTS_FROM = (None, 0.1, -0.1, 2.6)  # rad beyond what it was; None: zero
+COUNTED = ("cycles", "estimates", "missed_cycles", "overruns")  # of a daemon's document
 _ON_ANY_BUS = {
     *("mute", "delay", "resize", "repeat", "reverse", "drop_sync", "emergency", "mend", "kill", "revive"),
     *(
@@ -131,6 +132,7 @@ class Soak:
         self._options = options
         self._draw = random.Random(options.seed)
         self.played: Counter[str] = Counter()
+        self.counted: Counter[str] = Counter()
         self.rows: list[tuple[float, int, int, int]] = []
         self.wrong: list[Episode] = []
         self.slowest = (0.0, "")
@@ -138,39 +140,46 @@ class Soak:
 
     def run(self) -> dict[str, Any]:
         """Play faults until the time is over; what was counted."""
-        lockstep = self._options.lockstep
-        stage = LockstepStage(vsa(), setattr) if lockstep else RealStage(vsa(), together=True)
-        start = self._time_s(stage)
-        try:
-            stage.settle()
-            while self._time_s(stage) - start < self._options.seconds:
-                self._one(stage)
-                self.rows.append((self._time_s(stage) - start, *measured(stage)))
-            return self._summary(stage, self._time_s(stage) - start)
-        finally:
-            stage.close()
+        lockstep, done = self._options.lockstep, 0.0
+        while True:  # with another daemon after one that has not become well again
+            stage = LockstepStage(vsa(), setattr) if lockstep else RealStage(vsa(), together=True)
+            start, well = self._time_s(stage) - done, True
+            try:
+                stage.settle()
+                while well and done < self._options.seconds:
+                    well = self._one(stage)
+                    done = self._time_s(stage) - start
+                    self.rows.append((done, *measured(stage)))
+                document = stage.document()
+                self.counted.update({key: document[key] for key in COUNTED}, samples_checked=stage.checked)
+                if well:
+                    return self._summary(done)
+            finally:
+                stage.close()
 
     def _time_s(self, stage: Stage) -> float:
         in_cycles = self._options.lockstep
         return stage.daemon.loop.cycles * stage.joint.bus.period_s if in_cycles else time.monotonic()
 
-    def _one(self, stage: Stage) -> None:
+    def _one(self, stage: Stage) -> bool:
+        """Play a fault; whether all was well afterwards."""
         played = self._begin(stage)
         names = " + ".join(fault.name for fault in played)
         ended = self._time_s(stage)
+        lost = ""
         try:
             stage.settle()
         except AssertionError as error:
-            error.add_note(f"seed {self._options.seed}, {names}")
-            raise
+            lost = str(error)
         self.slowest = max(self.slowest, (self._time_s(stage) - ended, names))
         self.said += len(stage.said.lines)
-        for what in filter(None, (stage.wrong_samples(), wrong_value(stage))):
+        for what in filter(None, (stage.wrong_samples(), wrong_value(stage), lost)):
             self.wrong.append(Episode(self._options.seed, stage.daemon.loop.cycles, names, what))
             print(*self.wrong[-1], sep="; ", file=sys.stderr, flush=True)
         self.played.update(fault.name for fault in played)
         stage.run(self._draw.uniform(0.0, 1.0))
         stage.forget()
+        return not lost
 
     def _begin(self, stage: Stage) -> list[Fault]:
         """Let one fault take its course, and perhaps another one that begins meanwhile."""
@@ -196,19 +205,14 @@ class Soak:
             if action in ("reboot", "revive") and self._draw.random() < self._options.recount:
                 stage.schedule(seconds, partial(stage.recount, arguments[0], self._draw.choice(COUNTS_FROM)))
 
-    def _summary(self, stage: Stage, seconds: float) -> dict[str, Any]:
-        document = stage.document()
+    def _summary(self, seconds: float) -> dict[str, Any]:
         late = [row for row in self.rows if row[0] > min(FILLING_S, seconds / 3)]
         _, memory, threads, objects = (np.array(column, dtype=float) for column in zip(*late, strict=True))
         return {
             "seconds": round(seconds, 1),
-            "cycles": document["cycles"],
-            "estimates": document["estimates"],
-            "missed_cycles": document["missed_cycles"],
-            "overruns": document["overruns"],
+            **self.counted,
             "faults": sum(self.played.values()),
             "kinds": dict(self.played),
-            "samples_checked": stage.checked,
             "wrong_episodes": [episode._asdict() for episode in self.wrong],
             "slowest_recovery_s": round(self.slowest[0], 2),
             "slowest_recovery_of": self.slowest[1],

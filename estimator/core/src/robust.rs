@@ -336,17 +336,17 @@ impl Robust {
         }
         self.last = *now;
         self.unsettled -= 1;
-        let (mut late, mut lost) = (None, false);
+        let (mut late, mut lost) = (None, [false; MOTORS]);
         for (i, shift) in shifts.into_iter().enumerate() {
             match shift {
                 Some(Shift::Late(periods)) => late = Some(periods),
                 Some(Shift::Zero(off)) => self.recentre(i, off),
-                Some(Shift::Lost) => lost = true,
+                Some(Shift::Lost) => lost[i] = true,
                 None => {}
             }
         }
-        if lost {
-            self.lose_here();
+        if lost.contains(&true) {
+            self.lose_here(lost);
         } else if let Some(periods) = late {
             self.shift(periods);
         }

@@ -60,6 +60,7 @@ fn model(law: Law, parameters: Vec<f64>, effects: bool) -> Model {
         damping: 0.02,
         damping_std: None,
         transmission: Transmission::Elastic { law, order: None, parameters, covariance: None },
+        fit_rms: None,
         effects: if effects { elements(false) } else { Vec::new() },
     };
     Model {

@@ -167,7 +167,8 @@ impl Blocks {
 
     /// Where the zero between the encoders is, is not known any more.
     pub fn lose_zero(&mut self) {
-        if let Some(carried) = self.carried.as_ref().filter(|_| self.lost) {
+        let found = self.located && !self.doubting && !self.is_unconfirmed() && self.is_explained();
+        if let Some(carried) = self.carried.as_ref().filter(|_| self.lost && !found) {
             // What was learned without a zero may be of another one: as it was before.
             self.spring.alpha[..TERMS].copy_from_slice(&carried.x[SPRING]);
         } else {

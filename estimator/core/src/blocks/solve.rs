@@ -60,25 +60,28 @@ impl Blocks {
         self.spring.known |= best.is_some();
     }
 
-    /// Where a lost zero is by evidence, in steps over the deflections that the joint has had; `None`: it may be elsewhere.
+    /// Where a lost zero is by evidence: linearised in steps over the deflections that the joint has had; `None`: all that
+    /// explain the rows do not agree.
     fn locate(&self, total: &Gram, noise: f64) -> Option<f64> {
         let (carried, [low, high]) = (self.carried.as_ref()?, self.seen);
         let projection = Projection::between(&self.family, self.deflection, low, high);
         let mut tried = self.spring.clone();
-        let step = carried.deflection / f64::from(ZEROS);
-        let logs: [f64; 2 * ZEROS as usize + 1] = std::array::from_fn(|k| {
+        let step = carried.deflection.max(high - low) / f64::from(ZEROS);
+        let found: [(f64, f64); 2 * ZEROS as usize + 1] = std::array::from_fn(|k| {
             tried.zero = step * (k as f64 - f64::from(ZEROS));
+            let nothing = (f64::NEG_INFINITY, tried.zero);
             if (tried.zero + low).abs().max((tried.zero + high).abs()) > REACHED * tried.reach() {
-                return f64::NEG_INFINITY;
+                return nothing;
             }
             let frame = tried.frame(&projection);
             let prior = self.prior_of(&tried, total, &frame, self.deflection);
-            log_evidence(&frame.reduce(total), frame.set & ACTIVE, &prior, noise)
+            let reduced = frame.reduce(total);
+            solve(&reduced, frame.set & ACTIVE, &prior, noise)
+                .map_or(nothing, |one| (one.log_evidence, tried.zero + one.x[ZERO]))
         });
-        let best = (0..logs.len()).max_by(|a, b| logs[*a].total_cmp(&logs[*b]))?;
-        let rival = |k: usize| k.abs_diff(best) > 2 && logs[k] > logs[best] - ACCUSED.ln();
-        (logs[best].is_finite() && !(0..logs.len()).any(rival))
-            .then(|| step * (best as f64 - f64::from(ZEROS)))
+        let best = found.iter().copied().max_by(|a, b| a.0.total_cmp(&b.0))?;
+        let rival = |one: &(f64, f64)| (one.1 - best.1).abs() > 2.0 * step && one.0 > best.0 - ACCUSED.ln();
+        (best.0.is_finite() && !found.iter().any(rival)).then_some(best.1)
     }
 
     /// Whether the balance can be linearised where its zero is.

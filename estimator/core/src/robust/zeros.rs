@@ -4,7 +4,6 @@ use super::Robust;
 use crate::align::Positions;
 use crate::external::LinkMomentum;
 use crate::sample::MOTORS;
-use crate::side::Side;
 
 const HOME: f64 = 0.01; // of a jump: a zero that comes back so near to the first one is that one
 const FORESEEN_S: f64 = 0.04; // how far ahead a deflection is extrapolated
@@ -34,34 +33,31 @@ impl Robust {
         side.recentre(at.motor[i], at.deflection(i), self.last.torque[i]);
     }
 
-    /// Positions may count from anywhere: from where they did, if blocks bear it out, or from this moment's.
+    /// Positions may count from anywhere: each motor's from where they did, if blocks bear it out, or from here.
     pub(super) fn resume(&mut self, at: &Positions) {
         let now = at.from_zeros(&self.zeros);
-        let as_before = |(i, side): (usize, &Side)| side.may_be_as_before(now.deflection(i));
-        if self.sides.iter().enumerate().all(as_before) {
-            self.sides.iter_mut().for_each(Side::suspect_zero);
-        } else {
-            self.count_from(&now);
-        }
-    }
-
-    /// Where the zeros are is not known: deflections are counted from these.
-    fn count_from(&mut self, now: &Positions) {
         for (i, side) in self.sides.iter_mut().enumerate() {
-            self.zeros.motor[i] -= if self.flexible { now.deflection(i) } else { 0.0 };
-            side.move_zero(false);
+            if side.may_be_as_before(now.deflection(i)) {
+                side.suspect_zero();
+            } else {
+                self.zeros.motor[i] -= if self.flexible { now.deflection(i) } else { 0.0 };
+                side.move_zero(false);
+            }
         }
     }
 
-    /// The zeros are not where they were before a restart.
-    pub(super) fn lose_here(&mut self) {
-        let now = self.last.at;
-        self.count_from(&now);
+    /// Blocks say that a motor's zero is not where it was before a restart; nor are those of which they say nothing yet.
+    pub(super) fn lose_here(&mut self, lost: [bool; MOTORS]) {
         self.unsettled = self.settle;
         for (i, side) in self.sides.iter_mut().enumerate() {
-            let off = if self.flexible { now.deflection(i) } else { 0.0 };
+            if !lost[i] && !side.blocks.is_suspected() {
+                continue;
+            }
+            let off = if self.flexible { self.last.at.deflection(i) } else { 0.0 };
+            self.zeros.motor[i] -= off;
             self.last.at.motor[i] += off;
             self.last.present.motor[i] += off;
+            side.move_zero(false);
             side.restart(self.last.at.motor[i], self.last.at.deflection(i), self.last.torque[i]);
         }
     }

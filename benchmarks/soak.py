@@ -9,8 +9,9 @@ With --two another one begins during that share of them; with --recount the enco
 after that share of reboots. Beside every VALID estimate stands the truth: its values are of its SYNC,
 stiffness and torque are right by the rules of the fault matrix. What is not is an episode, told with its
 seed; so is a daemon that is not well again, after which another one begins. With --lockstep time is the
-number of cycles: the same faults on a machine that has other things to do. Memory is the resident set after a collection, with the C library's allocator alone, so that what is
-freed is seen to be (Python's own keeps it); threads are counted. Both must be flat once the first minute,
+number of cycles: the same faults on a machine that has other things to do. Memory is the
+resident set after a collection, with the C library's allocator alone, so that what is freed
+is seen to be (Python's own keeps it); threads are counted. Both must be flat once the first minute,
 in which buffers fill, is over: medians of the first and the last third are compared.
 """
 

@@ -158,8 +158,8 @@ class Motor:
             the gate tests for recordings that are not.
         inertia_std_relative: relative standard deviation of B; None: that of `estimator.priors`.
         viscous_damping_std_nm_s_rad: standard deviation of D_theta, likewise.
-        fit_rms_nm: rms of what the model leaves of the motor's torque in the recording that it is fitted to, and
-            rms of that torque; None: no recording.
+        fit_rms_nm: rms of what the model leaves of the motor's torque in the recording that it is fitted to,
+            and rms of that torque; None: no recording.
     """
 
     inertia_kg_m2: float

@@ -395,7 +395,7 @@ class JointFile(_Section):
         )
 
     def _fits(self) -> Sequence[tuple[float, float] | None]:
-        """Return what the fit that wrote this file has left of each motor's torque, and that torque, rms, N·m."""
+        """Return what this file's fit has left of each motor's torque, and that torque, rms, N·m."""
         entry = self.provenance.get("floor")
         baseline = ResidualBaseline.from_dict(entry) if isinstance(entry, dict) else None
         if baseline is None or len(baseline.residual_nm) < len(self.motor):

@@ -21,22 +21,6 @@ from estimator.identify import identify
 from estimator.model_monitor import ModelMonitor, ResidualBaseline, measure_baseline
 from estimator.sample import Sample, Status
 
-__all__ = [
-    "FAULTS",
-    "JOINTS",
-    "LADDERS",
-    "SIGNALS",
-    "STEPS",
-    "Fault",
-    "Outcome",
-    "errors",
-    "faults",
-    "garbled",
-    "outcome",
-    "stepped",
-    "unnoticed",
-]
-
 SIGNALS = ("motor", "torque", "link")
 SUSPECTS = {  # what `suspected` may call each of them
     "motor": ("motor_position", "motor_or_link_position"),
@@ -50,9 +34,7 @@ FLAGS = int(Status.CHANGED | Status.MODEL_ALARM | Status.INPUT_REJECTED | Status
 T = kit.PERIOD_S
 
 Values = np.ndarray
-Spoil = Callable[
-    [Values, float, np.random.Generator], Values
-]  # (values, largest healthy one, random) -> values
+Spoil = Callable[[Values, float, np.random.Generator], Values]  # of values, their largest healthy one, random
 
 
 class Fault(NamedTuple):
@@ -88,36 +70,32 @@ class Outcome(NamedTuple):
         return any(self.suspected in SUSPECTS[signal] for signal in fault.signals)
 
 
-def _frozen_noisy(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
-    return x[0] + share * size * rng.normal(size=len(x))
-
-
-def _stuck(x: Values, size: float, rng: np.random.Generator) -> Values:
-    return np.full_like(x, x[0])
-
-
-def _drift(x: Values, size: float, rng: np.random.Generator, per_s: float) -> Values:
-    return x + per_s * T * np.arange(len(x))
-
-
-def _offset(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
-    return x + share * size
-
-
-def _counts_from(x: Values, size: float, rng: np.random.Generator, rad: float) -> Values:
-    return x - x[0] if rad == 0.0 else x + rad
-
-
-def _ramp(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
-    return x + np.linspace(0.0, share * size, len(x))
-
-
 def _gain(x: Values, size: float, rng: np.random.Generator, factor: float) -> Values:
     return factor * x
 
 
 def _gain_drifts(x: Values, size: float, rng: np.random.Generator, to: float) -> Values:
     return x * np.linspace(1.0, to, len(x))
+
+
+def _offset(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
+    return x + share * size
+
+
+def _drift(x: Values, size: float, rng: np.random.Generator, per_s: float) -> Values:
+    return x + per_s * T * np.arange(len(x))
+
+
+def _late(x: Values, size: float, rng: np.random.Generator, periods: int) -> Values:
+    return np.concatenate([np.full(periods, x[0]), x[:-periods]])
+
+
+def _noise(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
+    return x + share * size * rng.normal(size=len(x))
+
+
+def _counts_from(x: Values, size: float, rng: np.random.Generator, rad: float) -> Values:
+    return x - x[0] if rad == 0.0 else x + rad
 
 
 def _slip(x: Values, size: float, rng: np.random.Generator, share: float, every_s: float) -> Values:
@@ -130,19 +108,7 @@ def _spikes(x: Values, size: float, rng: np.random.Generator, rate: float) -> Va
     return x + np.where(hit, rng.choice([-1.0, 1.0], len(x)) * size, 0.0)
 
 
-def _late(x: Values, size: float, rng: np.random.Generator, periods: int) -> Values:
-    return np.concatenate([np.full(periods, x[0]), x[:-periods]])
-
-
-def _noise(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
-    return x + share * size * rng.normal(size=len(x))
-
-
-def _coarse(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
-    return np.round(x / (share * size)) * share * size
-
-
-def _slow(x: Values, size: float, rng: np.random.Generator, periods: int) -> Values:
+def _held(x: Values, size: float, rng: np.random.Generator, periods: int) -> Values:
     return x[np.arange(len(x)) // periods * periods]
 
 
@@ -150,8 +116,10 @@ def faults() -> Iterator[Fault]:
     """All of them."""
     for signal in SIGNALS:
         one = (signal,)
-        yield Fault("frozen with noise", one, partial(_frozen_noisy, share=1e-4))
-        yield Fault("stuck", one, _stuck)
+        yield Fault(
+            "frozen with noise", one, lambda x, size, rng: x[0] + 1e-4 * size * rng.normal(size=len(x))
+        )
+        yield Fault("stuck", one, lambda x, size, rng: np.full_like(x, x[0]))
         for per_s in (0.01, 0.1) if signal != "torque" else ():
             yield Fault(f"drift {per_s:g} rad/s", one, partial(_drift, per_s=per_s))
         for share in (0.02, 0.1):
@@ -159,7 +127,7 @@ def faults() -> Iterator[Fault]:
         for factor in (0.75, 0.9, 1.1, 1.25):
             yield Fault(f"gain {factor:g}", one, partial(_gain, factor=factor))
         if signal == "torque":
-            yield Fault("ramps by 20 %", one, partial(_ramp, share=0.2))
+            yield Fault("ramps by 20 %", one, lambda x, size, rng: x + np.linspace(0.0, 0.2 * size, len(x)))
         yield Fault("gain drifts to 1.25", one, partial(_gain_drifts, to=1.25))
         yield Fault("sign", one, partial(_gain, factor=-1.0))
         for periods in (1, 3, 10):
@@ -167,10 +135,10 @@ def faults() -> Iterator[Fault]:
         for rate in (1e-3, 1e-2, 0.1):
             yield Fault(f"spikes {rate:g}", one, partial(_spikes, rate=rate))
         yield Fault("noise 1 %", one, partial(_noise, share=0.01))
-        yield Fault("steps of 2 %", one, partial(_coarse, share=0.02))
-        yield Fault("every 10th", one, partial(_slow, periods=10))
+        yield Fault("steps of 2 %", one, lambda x, size, rng: np.round(x / (0.02 * size)) * 0.02 * size)
+        yield Fault("every 10th", one, partial(_held, periods=10))
         if signal != "torque":
-            yield Fault("every 50th", one, partial(_slow, periods=50))
+            yield Fault("every 50th", one, partial(_held, periods=50))
             yield Fault("zero off by 0.1 rad", one, partial(_counts_from, rad=0.1), from_start=True)
             for rad in (0.0, 0.1, 2.6):
                 where = f"{rad:g} rad further on" if rad else "zero"
@@ -192,31 +160,15 @@ LADDERS: dict[str, tuple[str, tuple[float, ...], tuple[str, ...], Callable[[floa
     # kind: (its size, sizes from small to large, signals, what a size does)
     "scale": ("{:.1%}", (0.01, 0.02, 0.05, 0.1, 0.25), SIGNALS, lambda s: partial(_gain, factor=1.0 + s)),
     "scale drifts, in 8 s": (
-        "{:.1%}",
-        (0.01, 0.02, 0.05, 0.1, 0.25),
-        SIGNALS,
-        lambda s: partial(_gain_drifts, to=1.0 + s),
-    ),
+        "{:.1%}", (0.01, 0.02, 0.05, 0.1, 0.25), SIGNALS, lambda s: partial(_gain_drifts, to=1.0 + s)),
     "offset, of the largest value": (
-        "{:.1%}",
-        (0.001, 0.003, 0.01, 0.03, 0.1),
-        SIGNALS,
-        lambda s: partial(_offset, share=s),
-    ),
+        "{:.1%}", (0.001, 0.003, 0.01, 0.03, 0.1), SIGNALS, lambda s: partial(_offset, share=s)),
     "drift": (
-        "{:g} rad/s",
-        (1e-4, 3e-4, 1e-3, 3e-3, 1e-2),
-        ("motor", "link"),
-        lambda s: partial(_drift, per_s=s),
-    ),
+        "{:g} rad/s", (1e-4, 3e-4, 1e-3, 3e-3, 1e-2), ("motor", "link"), lambda s: partial(_drift, per_s=s)),
     "late": ("{:g} periods", (1, 2, 3, 5, 10), SIGNALS, lambda s: partial(_late, periods=int(s))),
     "noise, of the largest value": (
-        "{:.2%}",
-        (1e-4, 3e-4, 1e-3, 3e-3, 1e-2),
-        SIGNALS,
-        lambda s: partial(_noise, share=s),
-    ),
-}
+        "{:.2%}", (1e-4, 3e-4, 1e-3, 3e-3, 1e-2), SIGNALS, lambda s: partial(_noise, share=s)),
+}  # fmt: skip
 
 
 @lru_cache(maxsize=8)
@@ -237,27 +189,24 @@ def _fitted(name: str) -> tuple[JointModel, ResidualBaseline]:
 def _spoilt(samples: list[Sample], begin: int, fault: Fault, seed: int) -> list[Sample]:
     rng = np.random.default_rng([seed, zlib.crc32(f"{fault.name} {fault.signals}".encode())])
     begin = 0 if fault.from_start else begin
-    out = samples[:begin]
-    columns = {
-        "motor": np.array([s.motor_position_rad[0] for s in samples]),
-        "torque": np.array([s.motor_torque_nm[0] for s in samples]),
-        "link": np.array([s.link_position_rad for s in samples]),
-    }
-    for signal in fault.signals:
-        x = columns[signal]
-        columns[signal][begin:] = fault.spoil(
-            x[begin:].copy(), float(np.max(np.abs(x[:begin]), initial=0.0)), rng
+    motor, torque, link = (
+        np.array(values, float)
+        for values in zip(
+            *((s.motor_position_rad[0], s.motor_torque_nm[0], s.link_position_rad) for s in samples),
+            strict=True,
         )
-    for k in range(begin, len(samples)):
-        s = samples[k]
-        out.append(
-            s._replace(
-                motor_position_rad=(float(columns["motor"][k]), *s.motor_position_rad[1:]),
-                motor_torque_nm=(float(columns["torque"][k]), *s.motor_torque_nm[1:]),
-                link_position_rad=float(columns["link"][k]),
-            )
+    )
+    columns = {"motor": motor, "torque": torque, "link": link}
+    for x in (columns[signal] for signal in fault.signals):
+        x[begin:] = fault.spoil(x[begin:].copy(), float(np.max(np.abs(x[:begin]), initial=0.0)), rng)
+    return samples[:begin] + [
+        s._replace(
+            motor_position_rad=(float(motor[k]), *s.motor_position_rad[1:]),
+            motor_torque_nm=(float(torque[k]), *s.motor_torque_nm[1:]),
+            link_position_rad=float(link[k]),
         )
-    return out
+        for k, s in enumerate(samples[begin:], begin)
+    ]
 
 
 def outcome(joint: str, fault: Fault | None, health_s: float, fault_s: float, seed: int = 0) -> Outcome:
@@ -362,19 +311,13 @@ def garbled(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Valid and wrong samples, from the end of a time on in which readings had some of their bits turned.
 
-    Args:
-        joint: which.
-        share: of the samples that are hit, each signal of it with a probability of a half.
-        positions: whether those are hit too, or the torques alone.
-        health_s: before.
-        garbage_s: meanwhile.
-        after_s: that is judged.
-        seed: of all.
+    A `share` of the samples is hit, each signal of it with a probability of a half: the torques, or (`positions`)
+    all of them.
     """
-    motion = _healthy(joint, health_s + garbage_s + after_s, seed)
-    rng = np.random.default_rng(seed)
+    motion, rng = _healthy(joint, health_s + garbage_s + after_s, seed), np.random.default_rng(seed)
     begin, end = round(health_s / T), round((health_s + garbage_s) / T)
     most = max(abs(torque) for sample in motion.samples for torque in sample.motor_torque_nm)
+    angle = 2.0 * np.pi / 2**16
 
     def turned(value: float, count: float) -> float:
         if rng.random() < 0.5:
@@ -383,18 +326,12 @@ def garbled(
         return float(np.int16(np.uint16((round(value / count) & 0xFFFF) ^ int(bits)))) * count
 
     samples = list(motion.samples)
-    for k in range(begin, end):
-        if rng.random() < share:
-            sample = samples[k]
-            sample = sample._replace(
-                motor_torque_nm=tuple(turned(value, 1e-3 * most) for value in sample.motor_torque_nm)
-            )
-            if positions:
-                count = 2.0 * np.pi / 2**16
-                sample = sample._replace(
-                    motor_position_rad=tuple(turned(value, count) for value in sample.motor_position_rad),
-                    link_position_rad=turned(sample.link_position_rad, count),
-                )
-            samples[k] = sample
+    for k in (k for k in range(begin, end) if rng.random() < share):
+        s = samples[k]
+        s = s._replace(motor_torque_nm=tuple(turned(value, 1e-3 * most) for value in s.motor_torque_nm))
+        if positions:
+            motors = tuple(turned(value, angle) for value in s.motor_position_rad)
+            s = s._replace(motor_position_rad=motors, link_position_rad=turned(s.link_position_rad, angle))
+        samples[k] = s
     estimates, _ = _estimates(joint, samples, len(samples))
     return estimates.valid[end:], kit.wrong(estimates, motion.stiffness_nm_rad)[begin:]

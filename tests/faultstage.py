@@ -10,7 +10,7 @@ import inspect
 import logging
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -39,18 +39,19 @@ class Truth:
     Attributes:
         torque_rms_nm: rms of the flexibility torque until now.
         unseen: whether the devices did not see the last SYNC.
+        synced: whether they see one just now: it moves the world on, and then they sample.
     """
 
     def __init__(self, stage: Stage) -> None:
         self._world = stage.world
-        self._objects = [_position(stage.daemon, motor) for motor in range(stage.world.motors)]
-        self._objects.append(_link(stage.daemon))
+        self._objects = [_mapped(stage.daemon, Signal.MOTOR_POSITION, m) for m in range(stage.world.motors)]
+        self._objects.append(_mapped(stage.daemon, Signal.LINK_POSITION))
         self._history: list[tuple[int, ...]] = []
         self._physics: list[tuple[float, float]] = []  # stiffness and torque at the same SYNCs
         self._square, self.torque_rms_nm = 0.0, 0.0
         self._forgotten = 0
         self._inner = stage.world.advance
-        self._synced = self.unseen = False
+        self.synced = self.unseen = False
         stage.world.advance = self._advance  # type: ignore[method-assign]
 
     @property
@@ -58,15 +59,11 @@ class Truth:
         """SYNCs that the devices have seen."""
         return self._forgotten + len(self._history)
 
-    def sync(self) -> None:
-        """The devices see a SYNC: it moves the world on, and then they sample."""
-        self._synced = True
-
     def _advance(self, periods: int = 1) -> None:
         self._inner(periods)
-        if not self._synced:
+        if not self.synced:
             return
-        self._synced = False
+        self.synced = False
         world = self._world
         counts = [world.drive(motor).position_counts for motor in range(world.motors)]
         self._history.append((*counts, world.link_counts()))
@@ -130,19 +127,9 @@ class Sink(Collector):
         self.due.append(truth.syncs - (1 if current or truth.unseen else 2))
 
 
-def _objects(daemon: Daemon) -> Iterator[tuple[int | None, MappedObject]]:
-    for layout in daemon.layouts.values():
-        for tpdo in layout.tpdos:
-            for mapped in tpdo.objects:
-                yield layout.motor, mapped
-
-
-def _position(daemon: Daemon, motor: int) -> MappedObject:
-    return next(o for m, o in _objects(daemon) if m == motor and o.signal is Signal.MOTOR_POSITION)
-
-
-def _link(daemon: Daemon) -> MappedObject:
-    return next(o for _, o in _objects(daemon) if o.signal is Signal.LINK_POSITION)
+def _mapped(daemon: Daemon, signal: Signal, motor: int | None = None) -> MappedObject:
+    layouts = [layout for layout in daemon.layouts.values() if motor is None or layout.motor == motor]
+    return next(o for layout in layouts for tpdo in layout.tpdos for o in tpdo.objects if o.signal is signal)
 
 
 class _Said(logging.Handler):
@@ -191,11 +178,9 @@ class Stage:
         assert inner is not None
 
         def sync(data: bytes) -> bool:
-            seen = inner(data)
-            self.truth.unseen = not seen
-            if seen:
-                self.truth.sync()
-            return seen
+            self.truth.synced = inner(data)
+            self.truth.unseen = not self.truth.synced
+            return self.truth.synced
 
         self.network.sync_filter = sync
 
@@ -233,21 +218,13 @@ class Stage:
     # Play
 
     @property
-    def valid(self) -> bool:
-        estimate = self.loop_joint.pipeline.estimate
-        return (
-            estimate is not None
-            and bool(estimate.status & Status.VALID)
-            and self.loop_joint.pipeline.sample is not None
-        )
-
-    @property
     def well(self) -> bool:
         """Whether everything is as if nothing had ever been."""
+        pipeline, bad = self.loop_joint.pipeline, Status.BUS_FAULT | Status.STALE | Status.DRIVE_FAULT
         return (
-            self.valid
-            and not self.loop_joint.pipeline.estimate.status
-            & (Status.BUS_FAULT | Status.STALE | Status.DRIVE_FAULT)
+            pipeline.estimate is not None
+            and pipeline.estimate.status & (bad | Status.VALID) == Status.VALID
+            and pipeline.sample is not None
             and not self.daemon.events.active.keys() - self.of_the_machine
             and self.document()["state"] == "running"
         )

@@ -118,12 +118,7 @@ class RealStage(Stage):
     of_the_machine = frozenset({"too slow"})  # others use it too: cycles left out are said, and survived
 
     def __init__(self, joint: JointFile, *, together: bool = False) -> None:
-        """Begin.
-
-        Args:
-            joint: on which bus.
-            together: let the devices live in the daemon's thread, so that they are as prompt as drives.
-        """
+        """Begin; `together`: the devices live in the daemon's thread, so that they are as prompt as drives."""
         super().__init__(joint, _Wire(joint.bus))
         self._together = together
         devices = self._serve if together else None
@@ -144,14 +139,11 @@ class RealStage(Stage):
     def well(self) -> bool:
         if self._together:
             return super().well
-        pipeline = self.loop_joint.pipeline
-        estimate = pipeline.estimate
-        bad = Status.STALE | Status.DRIVE_FAULT
-        late = ("missing ", "conflicting ")
+        pipeline, late = self.loop_joint.pipeline, ("missing ", "conflicting ")
         return (
-            estimate is not None
+            pipeline.estimate is not None
             and pipeline.sample is not None
-            and not estimate.status & bad
+            and not pipeline.estimate.status & (Status.STALE | Status.DRIVE_FAULT)
             and all(key.startswith(late) for key in self.daemon.events.active)
             and self.document()["state"] == "running"
         )

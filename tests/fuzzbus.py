@@ -250,9 +250,8 @@ class FuzzBus:
         """An answer to the daemon's SDO, perhaps spoilt."""
         draw = self._random
         if self.rate and draw.random() < 0.02:
-            kind = draw.choice(
-                ("lost", "cut", "twice", "other", "abort") + ("changed",) * (3 * self._hostile)
-            )
+            kinds = ("lost", "cut", "twice", "other", "abort", *("changed",) * (3 * self._hostile))
+            kind = draw.choice(kinds)
             self.kinds["SDO " + kind] += 1
             cob_id, data = answer
             if kind == "lost":

@@ -26,9 +26,7 @@ from estimator.sample import Estimate, Sample, Status
 __all__ = ["FuzzRun", "WrongValidError"]
 
 PERIOD_S = 0.001
-FOLLOW = """configure = false
-sync = "follow"
-"""
+FOLLOW = 'configure = false\nsync = "follow"\n'
 
 
 class WrongValidError(AssertionError):
@@ -127,15 +125,7 @@ class FuzzRun:
         overflow: of the SYNC counter.
     """
 
-    def __init__(
-        self,
-        seed: int,
-        *,
-        hostile: bool = False,
-        passive: bool = False,
-        real: bool = False,
-        overflow: int = 0,
-    ) -> None:
+    def __init__(self, seed: int, *, hostile=False, passive=False, real=False, overflow=0) -> None:
         self.hostile = hostile or passive
         self.seed = seed
         self.joint: JointFile = parse(vsa_text(bus=FOLLOW if passive else ""))
@@ -148,14 +138,13 @@ class FuzzRun:
         self.judge = _Judge(self)
         loop_joint = LoopJoint("fuzzed", self.pipeline, self.judge)
         source: Any = ForeignMaster(self.bus) if passive else self.bus
-        self.loop = CycleLoop(
-            source,
-            [loop_joint],
-            period_s=PERIOD_S,
-            produce=not passive,
-            world_steps=True,
-            counter_overflow=overflow,
-        )
+        how = {
+            "period_s": PERIOD_S,
+            "produce": not passive,
+            "world_steps": True,
+            "counter_overflow": overflow,
+        }
+        self.loop = CycleLoop(source, [loop_joint], **how)
         self.bus.loop = self.loop
         self.events = EventLog(_Silent(), clock=lambda: self.loop.clock() * 1e-9)  # type: ignore[arg-type]
         watching = PassiveConfigurator([self.joint]) if passive else self.configurator
@@ -227,12 +216,11 @@ class FuzzRun:
 def _scales(layouts: Iterable[NodeLayout]) -> dict[str, float]:
     scales = {}
     for layout in layouts:
-        for frame in layout.tpdos:
-            for mapped in frame.objects:
-                if mapped.signal is Signal.MOTOR_POSITION:
-                    scales[f"motor{(layout.motor or 0) + 1}"] = mapped.scale
-                elif mapped.signal is Signal.LINK_POSITION:
-                    scales["link"] = mapped.scale
+        for mapped in (mapped for frame in layout.tpdos for mapped in frame.objects):
+            if mapped.signal is Signal.MOTOR_POSITION:
+                scales[f"motor{(layout.motor or 0) + 1}"] = mapped.scale
+            elif mapped.signal is Signal.LINK_POSITION:
+                scales["link"] = mapped.scale
     return scales
 
 
@@ -243,8 +231,5 @@ def _reraise(_where: str, error: Exception) -> None:
 class _Silent:
     """A log that nobody reads."""
 
-    def __init__(self) -> None:
-        self.lines = 0
-
     def log(self, *_: object) -> None:
-        self.lines += 1
+        pass

@@ -67,9 +67,8 @@ def vsa_ii(k: Array, c: Array) -> tuple[Callable[[Array], Array], Callable[[Arra
 
     def stiffness(phi: Array) -> Array:
         h = 1e-5
-        return (8 * (torque(phi + h) - torque(phi - h)) - (torque(phi + 2 * h) - torque(phi - 2 * h))) / (
-            12 * h
-        )
+        near, far = (torque(phi + d) - torque(phi - d) for d in (h, 2 * h))
+        return (8 * near - far) / (12 * h)
 
     return torque, stiffness
 

@@ -13,17 +13,8 @@ import numpy as np
 
 from drivelink._core import Assembler, JointPipeline
 from drivelink.cycle.pipeline import ResidualMonitor
-from estimator import (
-    Estimator,
-    EstimatorSettings,
-    JointModel,
-    Motor,
-    Record,
-    Sample,
-    Status,
-    Transmission,
-    make_estimator,
-)
+from estimator import Estimator, EstimatorSettings, JointModel, Motor, Record, Sample, Status, Transmission
+from estimator import make_estimator as make_estimator
 from sim.cases import case
 from sim.effects import PlantEffect
 from sim.plant import JointPlant, Spring
@@ -100,23 +91,15 @@ def motion(
         world.alter(plant=_stiffer(given.plant, step[1]))
         after = record(world, seconds - step[0])
         rows = {name: np.concatenate([before[name], after[name]]) for name in before}
-    motors = range(1, len(drives) + 1)
 
     def stacked(quantity: str) -> list[tuple[float, ...]]:
-        return list(zip(*(rows[f"motor{i}_{quantity}"].tolist() for i in motors), strict=True))
-
-    samples = [
-        Sample(k, theta, omega, tau, q)
-        for k, (theta, omega, tau, q) in enumerate(
-            zip(
-                stacked("position_rad"),
-                stacked("velocity_rad_s"),
-                stacked("torque_nm"),
-                rows["link_position_rad"].tolist(),
-                strict=True,
-            )
+        return list(
+            zip(*(rows[f"motor{i}_{quantity}"].tolist() for i in range(1, len(drives) + 1)), strict=True)
         )
-    ]
+
+    columns = map(stacked, ("position_rad", "velocity_rad_s", "torque_nm"))
+    together = zip(*columns, rows["link_position_rad"].tolist(), strict=True)
+    samples = [Sample(k, *values) for k, values in enumerate(together)]
     return Motion(samples, rows["truth_stiffness_nm_rad"], rows["truth_flexibility_torque_nm"])
 
 

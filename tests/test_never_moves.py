@@ -6,7 +6,6 @@ What is allowed is written down here once more, from CiA 301 and not from `drive
 import threading
 import time
 
-import can
 import pytest
 from can.interfaces.virtual import VirtualBus
 from daemonkit import DaemonRig, Listener, listens, patient, rig, running, served, vsa, vsa_text
@@ -67,7 +66,7 @@ def lives(made: DaemonRig) -> None:
 
 
 @pytest.mark.parametrize("profile", ["elmo", "nanotec"])
-def test_through_boot_run_reboot_and_configuration_no_frame_could_move_a_drive(profile: str) -> None:
+def test_through_boot_run_reboot_and_configuration_no_frame_could_move_a_drive(profile):
     joint = parse(vsa_text() + f'quirks = "{profile}"\n')
     listener = Listener(joint)
     try:
@@ -85,16 +84,16 @@ def test_through_boot_run_reboot_and_configuration_no_frame_could_move_a_drive(p
     assert [f"{c:03X} {d.hex(' ')}: {offence(c, d)}" for c, d in sent if offence(c, d)] == []
 
 
-def test_a_passive_daemon_puts_no_frame_on_the_bus_whatever_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_passive_daemon_puts_no_frame_on_the_bus_whatever_happens(monkeypatch):
     patient(monkeypatch)
     senders: list[tuple[object, int]] = []
     by_bus, by_source = VirtualBus.send, VirtualSource.send
 
-    def bus_send(self: VirtualBus, msg: can.Message, timeout: float | None = None) -> None:
+    def bus_send(self, msg, timeout=None):
         senders.append((self, msg.arbitration_id))
         by_bus(self, msg, timeout)
 
-    def source_send(self: VirtualSource, cob_id: int, data: bytes) -> None:
+    def source_send(self, cob_id, data):
         senders.append((self._bus, cob_id))
         by_source(self, cob_id, data)
 

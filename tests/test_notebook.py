@@ -24,7 +24,7 @@ def runner() -> ModuleType:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_the_notebook_finds_the_effect_and_its_outputs_are_stored(tmp_path: Path) -> None:
+def test_the_notebook_finds_the_effect_and_its_outputs_are_stored(tmp_path):
     made = runner()
     stored = json.loads(made.NOTEBOOK.read_text(encoding="utf-8"))
     executed, names = made.execute(made.NOTEBOOK, tmp_path)
@@ -33,13 +33,9 @@ def test_the_notebook_finds_the_effect_and_its_outputs_are_stored(tmp_path: Path
     assert effect.parameters["torque_nm"] == pytest.approx(0.004, rel=0.05)  # as it was switched on
     errors = names["outcome"].validation
     assert errors.after_rms_nm < 0.2 * errors.before_rms_nm
-    fitted, better = (
-        [one.name for one in jointfile.load(names[name]).motor[0].effect] for name in ("elbow", "better")
-    )
-    assert better == [
-        *fitted,
-        "coulomb_friction",
-    ]  # to the zero that the fit wrote, the diagnosis adds one effect
+    files = (jointfile.load(names[name]) for name in ("elbow", "better"))
+    fitted, better = ([one.name for one in file.motor[0].effect] for file in files)
+    assert better == [*fitted, "coulomb_friction"]  # to what the fit wrote, the diagnosis adds one effect
     for cell, fresh in zip(stored["cells"], executed["cells"], strict=True):
         shown = [[sorted(out.get("data", ())) for out in one.get("outputs", ())] for one in (cell, fresh)]
         assert shown[0] == shown[1], "run python docs/notebook.py"

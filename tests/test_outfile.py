@@ -9,9 +9,7 @@ import signal
 import stat
 import subprocess
 import sys
-import textwrap
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import joints
@@ -31,13 +29,13 @@ JOINT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.5\n[motor.transmission]\nm
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Iterator[Path]:
+def folder(tmp_path):
     """A folder in which nothing unfinished may be left."""
     yield tmp_path
     assert not list(tmp_path.rglob(".*.tmp"))
 
 
-def test_a_file_is_written_in_one_step_and_keeps_its_mode_and_its_links(folder: Path) -> None:
+def test_a_file_is_written_in_one_step_and_keeps_its_mode_and_its_links(folder):
     path, link = folder / "a.txt", folder / "link.txt"
     write_whole(path, "first")
     path.chmod(0o640)
@@ -49,7 +47,7 @@ def test_a_file_is_written_in_one_step_and_keeps_its_mode_and_its_links(folder: 
     assert path.stat().st_ino != before  # another file took its place: nobody saw it grow
 
 
-def test_without_force_an_existing_file_stays_even_one_that_came_meanwhile(folder: Path) -> None:
+def test_without_force_an_existing_file_stays_even_one_that_came_meanwhile(folder):
     path = folder / "a.txt"
     file = NewFile(path)
     os.write(file.fd, b"mine")
@@ -62,9 +60,7 @@ def test_without_force_an_existing_file_stays_even_one_that_came_meanwhile(folde
         write_whole(path, "mine")
 
 
-def test_a_file_system_without_hard_links_is_written_too(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_system_without_hard_links_is_written_too(folder, monkeypatch):
     def refused(*_: object) -> None:
         raise OSError(errno.EPERM, "Operation not permitted")
 
@@ -75,26 +71,17 @@ def test_a_file_system_without_hard_links_is_written_too(
         write_whole(folder / "a.txt", "another")
 
 
-def test_the_disk_has_the_file_before_its_name_and_the_folder_after(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done: list[str] = []
-
-    def synced(fd: int) -> None:
-        done.append("folder" if stat.S_ISDIR(os.fstat(fd).st_mode) else "file")
-
-    def replaced(self: Path, target: Path) -> Path:
-        done.append("name")
-        return self.rename(target)
-
-    monkeypatch.setattr(os, "fsync", synced)
-    monkeypatch.setattr(Path, "replace", replaced)
+def test_the_disk_has_the_file_before_its_name_and_the_folder_after(folder, monkeypatch):
+    done, replace = [], Path.replace
+    kind = lambda fd: "folder" if stat.S_ISDIR(os.fstat(fd).st_mode) else "file"  # noqa: E731
+    monkeypatch.setattr(os, "fsync", lambda fd: done.append(kind(fd)))
+    monkeypatch.setattr(Path, "replace", lambda self, target: (done.append("name"), replace(self, target))[1])
     write_whole(folder / "a.txt", "whole", force=True)
     assert done == ["file", "name", "folder"]
 
 
 @pytest.mark.parametrize("linked", [lambda a, b: b.symlink_to(a), lambda a, b: os.link(a, b)])
-def test_an_input_is_known_by_its_links(folder: Path, linked: Callable[[Path, Path], None]) -> None:
+def test_an_input_is_known_by_its_links(folder, linked):
     recording, other = folder / "r.csv", folder / "other.csv"
     recording.write_text("data")
     linked(recording, other)
@@ -103,7 +90,7 @@ def test_an_input_is_known_by_its_links(folder: Path, linked: Callable[[Path, Pa
             check_target(other, [recording], force=force)
 
 
-def test_a_write_protected_file_is_not_replaced(folder: Path) -> None:
+def test_a_write_protected_file_is_not_replaced(folder):
     path = folder / "a.txt"
     path.write_text("kept")
     path.chmod(0o444)
@@ -113,53 +100,53 @@ def test_a_write_protected_file_is_not_replaced(folder: Path) -> None:
         write_whole(path, "new", force=True)
 
 
-def test_a_full_disk_leaves_what_was_there(folder: Path) -> None:
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+from drivelink.files import write_whole
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+try:
+    write_whole(Path(sys.argv[1]), b"x" * 5000, force=True)
+except OSError as error:
+    print(error.filename, error.strerror)
+"""
+AGAIN = """
+import sys
+from pathlib import Path
+from drivelink.files import write_whole
+print("ready", flush=True)
+while True:
+    for letter in "ab":
+        write_whole(Path(sys.argv[1]), letter * 200_000, force=True)
+"""
+
+
+def test_a_full_disk_leaves_what_was_there(folder):
     """The limit of a file's size stands for a full disk: writing fails half-way."""
     path = folder / "a.txt"
     path.write_text("kept")
-    script = (
-        "import resource, signal, sys\nfrom pathlib import Path\n"
-        "from drivelink.files import write_whole\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
-        "try:\n    write_whole(Path(sys.argv[1]), b'x' * 5000, force=True)\n"
-        "except OSError as error:\n    print(error.filename, error.strerror)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script, str(path)], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", FULL, str(path)], capture_output=True, text=True)
     assert done.stdout == f"{path} {os.strerror(errno.EFBIG)}\n", done.stderr
     assert path.read_text() == "kept"
 
 
-def test_a_kill_at_any_moment_leaves_the_old_file_or_the_new_one(tmp_path: Path) -> None:
-    """A dozen kills of a process that replaces a file again and again."""
-    path = tmp_path / "a.txt"
-    texts = {letter * 200_000 for letter in "ab"}
+def test_a_kill_at_any_moment_leaves_the_old_file_or_the_new_one(tmp_path):
+    path, rng = tmp_path / "a.txt", np.random.default_rng(1)
     path.write_text("a" * 200_000)
-    script = textwrap.dedent(
-        """
-        import sys
-        from pathlib import Path
-        from drivelink.files import write_whole
-        print("ready", flush=True)
-        while True:
-            for letter in "ab":
-                write_whole(Path(sys.argv[1]), letter * 200_000, force=True)
-        """
-    )
-    rng = np.random.default_rng(1)
-    for _ in range(12):
-        process = subprocess.Popen([sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE)
-        assert process.stdout is not None and process.stdout.readline()
+    for _ in range(6):
+        process = subprocess.Popen([sys.executable, "-c", AGAIN, str(path)], stdout=subprocess.PIPE)
+        assert process.stdout.readline()
         time.sleep(rng.uniform(0.0, 0.02))
         process.kill()
         process.communicate()
-        assert path.read_text() in texts
+        assert path.read_text() in ("a" * 200_000, "b" * 200_000)
 
 
 # Recordings grow in their place
 
 
-def test_a_recording_takes_the_place_of_another_one_with_its_first_block(folder: Path) -> None:
+def test_a_recording_takes_the_place_of_another_one_with_its_first_block(folder):
     path = folder / "r.csv"
     path.write_text("an older recording")
     joint = parse(JOINT)
@@ -176,7 +163,7 @@ def test_a_recording_takes_the_place_of_another_one_with_its_first_block(folder:
     sink.close()
 
 
-def test_a_recording_that_never_began_leaves_nothing(folder: Path) -> None:
+def test_a_recording_that_never_began_leaves_nothing(folder):
     kept = folder / "kept.csv"
     kept.write_text("an older recording")
     for path, force in ((folder / "r.csv", False), (kept, True)):
@@ -185,7 +172,7 @@ def test_a_recording_that_never_began_leaves_nothing(folder: Path) -> None:
     assert sorted(folder.iterdir()) == [kept] and kept.read_text() == "an older recording"
 
 
-def test_a_full_disk_cuts_a_recording_at_a_whole_block(folder: Path) -> None:
+def test_a_full_disk_cuts_a_recording_at_a_whole_block(folder):
     file = SafeFile(folder / "r.bin")
     file.write(b"a" * 1000)
     file.sync()
@@ -207,7 +194,7 @@ def test_a_full_disk_cuts_a_recording_at_a_whole_block(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def data(tmp_path_factory):
     """Eight seconds of a linear joint, as CSV."""
     rng = np.random.default_rng(5)
     plants = joints.Plants(*joints.polynomial(np.array([[[100.0]]])), 0.5, 0.8, 0.4, 0.2, 5.0)
@@ -217,72 +204,56 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 @pytest.fixture
-def files(folder: Path, data: bytes) -> tuple[Path, Path]:
+def files(folder, data):
     recording, joint = folder / "r.csv", folder / "elbow.toml"
     recording.write_bytes(data)
     joint.write_text(JOINT + "# my own remark\n")
     return recording, joint
 
 
-@pytest.mark.parametrize("force", [[], ["--force"]])
+READ = "{r} --joint {j}"
+
+
 @pytest.mark.parametrize(
-    "arguments",
+    "command",
     [
-        ["replay", "{r}", "--joint", "{j}", "--out", "{r}"],
-        ["replay", "{r}", "--joint", "{j}", "--out", "{link}"],
-        ["replay", "{r}", "--joint", "{j}", "--out", "{hard}"],
-        ["replay", "{r}", "--joint", "{j}", "--out", "{j}"],
-        ["fit", "{r}", "--joint", "{j}", "--write", "{r}"],
-        ["fit", "{r}", "--joint", "{j}", "--write", "{link}"],
-        ["diagnose", "{r}", "--joint", "{j}", "--write", "{r}", "--out", "{d}"],
-        ["diagnose", "{r}", "--joint", "{j}", "--validate", "{v}", "--write", "{v}", "--out", "{d}"],
-        ["record", "{j}", "--out", "{j}"],
+        *(f"replay {READ} --out {out}" for out in ("{r}", "{link}", "{hard}", "{j}")),
+        *(f"fit {READ} --write {out}" for out in ("{r}", "{link}")),
+        f"diagnose {READ} --write {{r}} --out {{d}}",
+        f"diagnose {READ} --validate {{v}} --write {{v}} --out {{d}}",
+        "record {j} --out {j}",
     ],
 )
-def test_no_command_replaces_what_it_reads(
-    arguments: list[str],
-    force: list[str],
-    files: tuple[Path, Path],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_no_command_replaces_what_it_reads(command, files, capsys):
     recording, joint = files
     names = {name: recording.with_name(name) for name in ("link", "hard", "v", "d")}
     names["link"].symlink_to(recording)
     os.link(recording, names["hard"])
     names["v"].write_bytes(recording.read_bytes())
     before = {path: path.read_bytes() for path in (recording, joint, names["v"])}
-    filled = [a.format(r=recording, j=joint, **names) for a in arguments]
-    assert cli.main([*filled, *force]) == 2
-    err = capsys.readouterr().err
-    assert "is read here and must not be replaced" in err and err.count("\n") == 1
-    assert {path: path.read_bytes() for path in before} == before
+    for force in ([], ["--force"]):
+        assert cli.main([*command.format(r=recording, j=joint, **names).split(), *force]) == 2
+        err = capsys.readouterr().err
+        assert "is read here and must not be replaced" in err and err.count("\n") == 1
+        assert {path: path.read_bytes() for path in before} == before
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        ["replay", "{r}", "--joint", "{j}", "--out", "{out}"],
-        ["fit", "{r}", "--joint", "{j}", "--write", "{out}"],
-        ["new", "{out}", "--case", "constant"],
-    ],
+    "command", [f"replay {READ} --out {{out}}", f"fit {READ} --write {{out}}", "new {out} --case constant"]
 )
-def test_a_named_file_is_replaced_with_force_only(
-    arguments: list[str], files: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_named_file_is_replaced_with_force_only(command, files, capsys):
     recording, joint = files
     out = recording.with_name("out.x")
     out.write_text("kept")
-    filled = [a.format(r=recording, j=joint, out=out) for a in arguments]
-    assert cli.main(filled) == 2
-    assert capsys.readouterr().err == f"drivelink {filled[0]}: {out}: exists already; --force replaces it\n"
+    verb, *rest = command.format(r=recording, j=joint, out=out).split()
+    assert cli.main([verb, *rest]) == 2
+    assert capsys.readouterr().err == f"drivelink {verb}: {out}: exists already; --force replaces it\n"
     assert out.read_text() == "kept"
-    assert cli.main([*filled, "--force"]) == 0
+    assert cli.main([verb, *rest, "--force"]) == 0
     assert out.read_text() != "kept"
 
 
-def test_fit_brings_its_own_joint_file_up_to_date_in_one_step(
-    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fit_brings_its_own_joint_file_up_to_date_in_one_step(files, monkeypatch, capsys):
     recording, joint = files
     arguments = ["fit", str(recording), "--joint", str(joint), "--write", str(joint)]
     assert cli.main(arguments) == 2 and "--force replaces it" in capsys.readouterr().err
@@ -300,7 +271,7 @@ def test_fit_brings_its_own_joint_file_up_to_date_in_one_step(
     assert cli.main([*arguments, "--force"]) == 0  # and again, from what it wrote
 
 
-def test_a_results_folder_holds_what_the_last_run_found(files: tuple[Path, Path]) -> None:
+def test_a_results_folder_holds_what_the_last_run_found(files):
     recording, joint = files
     out = recording.parent / "fit"
     for _ in range(2):

@@ -20,22 +20,18 @@ import drivelink._core
 import estimator._core
 
 ROOT = Path(__file__).parent.parent
+TOOL = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
 
 
-def test_the_one_core_is_of_the_version_of_the_package() -> None:
+def test_the_one_core_is_of_the_version_of_the_package():
     assert estimator._core.__version__ == drivelink.__version__ == version("drivelink-vsa")
-    configured = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
-        "setuptools-rust"
-    ]
-    assert [module["target"] for module in configured["ext-modules"]] == ["estimator._core"]
+    assert [module["target"] for module in TOOL["setuptools-rust"]["ext-modules"]] == ["estimator._core"]
     named = vars(drivelink._core)
     assert all(named[name] is getattr(estimator._core, name) for name in drivelink._core.__all__)
 
 
-def test_every_data_file_of_the_packages_is_in_the_wheel() -> None:
-    package_data = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"][
-        "package-data"
-    ]
+def test_every_data_file_of_the_packages_is_in_the_wheel():
+    package_data = TOOL["setuptools"]["package-data"]
     packed = {
         path
         for package in ("drivelink", "estimator", "sim")
@@ -53,11 +49,10 @@ def test_every_data_file_of_the_packages_is_in_the_wheel() -> None:
     assert data <= packed
 
 
-def test_every_example_is_in_the_wheel() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+def test_every_example_is_in_the_wheel():
     shipped = {
         path
-        for target, patterns in project["tool"]["setuptools"]["data-files"].items()
+        for target, patterns in TOOL["setuptools"]["data-files"].items()
         for pattern in patterns
         for path in ROOT.glob(pattern)
         if target == f"share/drivelink/{path.relative_to(ROOT).parent}"
@@ -80,7 +75,7 @@ drivelink.fit
 """
 
 
-def test_the_client_alone_subscribes_with_numpy_and_zenoh_and_nothing_compiled(tmp_path: Path) -> None:
+def test_the_client_alone_subscribes_with_numpy_and_zenoh_and_nothing_compiled(tmp_path):
     runpy.run_path(str(ROOT / "packaging" / "client.py"))["write"](tmp_path / "client")
     project = tomllib.loads((tmp_path / "client" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert [need.split(">")[0] for need in project["dependencies"]] == ["numpy", "eclipse-zenoh"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import random
-from pathlib import Path
 
 import pytest
 
@@ -43,19 +42,19 @@ VARIANTS = {
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_each_variant_of_candump_gives_the_same_frames(name: str, tmp_path: Path) -> None:
+def test_each_variant_of_candump_gives_the_same_frames(name, tmp_path):
     path = tmp_path / "x.log"
     path.write_text(VARIANTS[name], newline="")
     assert list(read_frames(path)) == [FRAME, SYNC]
 
 
-def test_a_log_without_stamps_has_frames_without_stamps(tmp_path: Path) -> None:
+def test_a_log_without_stamps_has_frames_without_stamps(tmp_path):
     path = tmp_path / "x.log"
     path.write_text("  can0  181   [5]  2A 36 6C 2B BA\n  can0  080   [0]\n")
     assert [f.stamp_ns for f in read_frames(path)] == [NO_STAMP, NO_STAMP]
 
 
-def test_stamps_that_are_differences_are_added_up(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_stamps_that_are_differences_are_added_up(tmp_path, caplog):
     path = tmp_path / "x.log"
     path.write_text("".join(f" (000.000{200 + 600 * (k % 2)})  can0  080   [0]\n" for k in range(20)))
     with caplog.at_level(logging.WARNING, "drivelink.recording"):
@@ -65,46 +64,38 @@ def test_stamps_that_are_differences_are_added_up(tmp_path: Path, caplog: pytest
 
 
 def many_frames(n: int = 3000) -> list[LoggedFrame]:
-    rng = random.Random(1)
-    ids = (0x080, 0x181, 0x182, 0x18A)
+    rng, ids, begin = random.Random(1), (0x080, 0x181, 0x182, 0x18A), 1_700_000_000_000_000_000
     return [
-        LoggedFrame(
-            1_700_000_000_000_000_000 + 250_000 * k, ids[k % 4], rng.randbytes(8) if k % 4 else b"", "can0"
-        )
+        LoggedFrame(begin + 250_000 * k, ids[k % 4], rng.randbytes(8) if k % 4 else b"", "can0")
         for k in range(n)
     ]
 
 
-@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".trc"])
-@pytest.mark.parametrize("ended", [True, False])
-def test_what_is_recorded_is_read_back_also_without_its_end(suffix: str, ended: bool, tmp_path: Path) -> None:
-    path = tmp_path / f"x{suffix}"
+def recorded(path, frames, every, ended=True):
     sink = open_sink(path, JOINT)
-    frames = many_frames()
-    for k, frame in enumerate(frames):
+    for k, frame in enumerate(frames, 1):
         sink.frame(frame.stamp_ns, frame.can_id, frame.data)
-        if k % 1000 == 999:
+        if k % every == 0:
             sink.flush()
-    if ended:
-        sink.close()
-    else:
-        sink.abandon()
-    back = list(read_frames(path))
+    (sink.close if ended else sink.abandon)()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("suffix", "ended"), [(s, e) for s in (".log", ".blf", ".asc", ".trc") for e in (True, False)]
+)
+def test_what_is_recorded_is_read_back_also_without_its_end(suffix, ended, tmp_path):
+    frames = many_frames()
+    back = list(read_frames(recorded(tmp_path / f"x{suffix}", frames, 1000, ended)))
     assert [(f.can_id, f.data) for f in back] == [(f.can_id, f.data) for f in frames]
     first = back[0].stamp_ns - frames[0].stamp_ns  # ASC counts from its start, in microseconds
     assert all(abs(b.stamp_ns - f.stamp_ns - first) < 2000 for b, f in zip(back, frames, strict=True))
 
 
-def test_a_binary_log_cut_off_anywhere_gives_what_is_whole(tmp_path: Path) -> None:
+def test_a_binary_log_cut_off_anywhere_gives_what_is_whole(tmp_path):
     """Text logs are cut at every byte in test_recording_limits."""
-    path = tmp_path / "x.blf"
-    sink = open_sink(path, JOINT)
     frames = many_frames(1200)
-    for k, frame in enumerate(frames):
-        sink.frame(frame.stamp_ns, frame.can_id, frame.data)
-        if k % 200 == 199:
-            sink.flush()
-    sink.close()
+    path = recorded(tmp_path / "x.blf", frames, 200)
     whole = path.read_bytes()
     rng = random.Random(2)
     for _ in range(12):
@@ -114,7 +105,7 @@ def test_a_binary_log_cut_off_anywhere_gives_what_is_whole(tmp_path: Path) -> No
         assert [(f.can_id, f.data) for f in back] == [(f.can_id, f.data) for f in frames[: len(back)]]
 
 
-def test_of_several_channels_the_configured_one_is_taken(tmp_path: Path) -> None:
+def test_of_several_channels_the_configured_one_is_taken(tmp_path):
     path = tmp_path / "x.log"
     lines = [f"({k}.{c}00000) can{c} 18{c}#0{c}\n" for k in range(20) for c in (0, 1)]
     path.write_text("".join(lines))
@@ -133,9 +124,7 @@ def test_of_several_channels_the_configured_one_is_taken(tmp_path: Path) -> None
         ("x.asc", b"", "no CAN frame"),
     ],
 )
-def test_a_file_that_is_no_log_is_one_clear_line(
-    name: str, content: bytes, line: str, tmp_path: Path
-) -> None:
+def test_a_file_that_is_no_log_is_one_clear_line(name, content, line, tmp_path):
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(RecordingError) as caught:
@@ -151,7 +140,7 @@ def jumps(stamps_ms: list[float]) -> list[int]:
     return [jump for _, jump in numbered_ahead(syncs(stamps_ms), 1e-3)]
 
 
-def test_syncs_whose_stamps_come_in_a_burst_are_numbered_one_by_one() -> None:
+def test_syncs_whose_stamps_come_in_a_burst_are_numbered_one_by_one():
     stamps = [float(k) for k in range(200)]
     stamps[100:106] = [106.0] * 6  # the interface handed six over at once
     assert jumps(stamps) == [1] * 200
@@ -172,12 +161,12 @@ EVERY_MS = [float(k) for k in range(300)]
     ],
     ids=["burst", "lost", "not due", "drift"],
 )
-def test_gaps_are_what_is_lost_and_nothing_else(stamps_ms: list[float], expected: dict[int, int]) -> None:
+def test_gaps_are_what_is_lost_and_nothing_else(stamps_ms, expected):
     assert {k: jump for k, jump in enumerate(jumps(stamps_ms)) if jump != 1} == expected
 
 
 @pytest.mark.parametrize("factor", [1.04, 1.5, 3.0])
-def test_a_recorder_numbers_by_the_period_that_sync_has(factor: float) -> None:
+def test_a_recorder_numbers_by_the_period_that_sync_has(factor):
     numbering = SyncNumbering(1e-3, measure=True)
     frames = syncs([k * factor for k in range(300)])
     jumps = [jump for frame in frames for _, jump in numbering.push(frame)]

@@ -10,7 +10,6 @@ import logging
 import math
 import struct
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -122,40 +121,38 @@ def vector_asc(lines: list[Line], *, base: str = "hex", stamps: str = "absolute"
     return "".join([*out, "End TriggerBlock\r\n"]).encode("cp1252")
 
 
+PEAK_ROWS = {
+    "1.0": "{n:6})  {t:10.3f}  {i}  {l}  {b}",
+    "1.1": "{n:6})  {t:12.3f}  Rx     {i}  {l}  {b}",
+    "1.2": "{n:6})  {t:12.3f} 1  Rx     {i}  {l}  {b}",
+    "1.3": "{n:6})  {t:12.3f} 1  Rx     {i} -  {l}    {b}",
+    "2.0": "{n:7}  {t:12.3f} {d}     {i} Rx {l}  {b}",
+    "2.1": "{n:7}  {t:12.3f} {d} 1      {i} Rx -  {l}    {b}",
+}
+PEAK_ERRORS = {
+    "1.0": "{n:6})  {t:10.1f}  FFFFFFFF  4  00 00 00 08  BUSHEAVY",
+    "1.1": "{n:6})  {t:12.3f} Error 0008 4 00 19 08 08",
+    "1.2": "{n:6})  {t:12.3f} 1  Error 0008 4 00 19 08 08",
+    "1.3": "{n:6})  {t:12.3f} 1  Error 0008 - 4 00 19 08 08",
+    "2.0": "{n:7}  {t:12.3f} ER     -    Rx  5    04 02 00 00 00",
+    "2.1": "{n:7}  {t:12.3f} ER 1     -    Rx -  5    04 02 00 00 00",
+}
+
+
 def peak_trc(lines: list[Line], version: str) -> bytes:
     out = [";##########################################################################\r\n"]
     if version != "1.0":
         out = [f";$FILEVERSION={version}\r\n", ";$STARTTIME=45661.5928269676\r\n"]
     if version[0] == "2":
-        out.append(
-            f";$COLUMNS=N,O,T,{'B,' if version == '2.1' else ''}I,d,{'R,' if version == '2.1' else ''}L,D\r\n"
-        )
+        out.append(f";$COLUMNS={'N,O,T,B,I,d,R,L,D' if version == '2.1' else 'N,O,T,I,d,L,D'}\r\n")
     out.append(";   PCAN-View, the file is as it is\r\n;\r\n")
     for number, (t, can_id, data, kind) in enumerate(lines, 1):
         ms = (t - lines[0].time_s) * 1e3
         name = f"{can_id:08X}" if kind == "extended" else f"{can_id:04X}"
         bytes_ = "RTR" if kind == "remote" else spaced(data)
-        if kind == "error":
-            if version == "1.0":
-                out.append(f"{number:6})  {ms:10.1f}  FFFFFFFF  4  00 00 00 08  BUSHEAVY\r\n")
-            elif version[0] == "2":
-                out.append(
-                    f"{number:7}  {ms:12.3f} ER {'1 ' if version == '2.1' else ''}    -    Rx {'- ' if version == '2.1' else ''} 5    04 02 00 00 00\r\n"
-                )
-            else:
-                bus_ = "1  " if version in ("1.2", "1.3") else ""
-                out.append(
-                    f"{number:6})  {ms:12.3f} {bus_}Error 0008 {'- ' if version == '1.3' else ''}4 00 19 08 08\r\n"
-                )
-            continue
-        out.append({
-            "1.0": f"{number:6})  {ms:10.3f}  {name}  {len(data)}  {bytes_}\r\n",
-            "1.1": f"{number:6})  {ms:12.3f}  Rx     {name}  {len(data)}  {bytes_}\r\n",
-            "1.2": f"{number:6})  {ms:12.3f} 1  Rx     {name}  {len(data)}  {bytes_}\r\n",
-            "1.3": f"{number:6})  {ms:12.3f} 1  Rx     {name} -  {len(data)}    {bytes_}\r\n",
-            "2.0": f"{number:7}  {ms:12.3f} {'RR' if kind == 'remote' else 'DT'}     {name} Rx {len(data)}  {bytes_}\r\n",
-            "2.1": f"{number:7}  {ms:12.3f} {'RR' if kind == 'remote' else 'DT'} 1      {name} Rx -  {len(data)}    {bytes_}\r\n",
-        }[version])  # fmt: skip
+        rr = "RR" if kind == "remote" else "DT"
+        row = PEAK_ERRORS[version] if kind == "error" else PEAK_ROWS[version]
+        out.append(row.format(n=number, t=ms, i=name, d=rr, l=len(data), b=bytes_) + "\r\n")
     return "".join(out).encode("cp1252")
 
 
@@ -196,7 +193,7 @@ TOOLS: dict[str, tuple[str, Callable[[list[Line]], bytes]]] = {
 
 @pytest.mark.parametrize("node", [1, 5])
 @pytest.mark.parametrize("tool", TOOLS)
-def test_what_a_tool_wrote_is_decoded_as_it_was(tool: str, node: int, tmp_path: Path) -> None:
+def test_what_a_tool_wrote_is_decoded_as_it_was(tool, node, tmp_path):
     suffix, write = TOOLS[tool]
     path = tmp_path / f"r{suffix}"
     path.write_bytes(write(bus()))
@@ -212,57 +209,43 @@ def test_what_a_tool_wrote_is_decoded_as_it_was(tool: str, node: int, tmp_path: 
 
 
 @pytest.mark.parametrize("jump_s", [3600.0, -3600.0, -2.5, 1e6])
-def test_a_clock_that_is_set_makes_a_gap_and_loses_nothing(
-    jump_s: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "r.log"
-    half = CYCLES // 2 * 1e-3 - 1e-4
-    path.write_bytes(
-        candump([line._replace(time_s=line.time_s + (jump_s if line.time_s > half else 0)) for line in bus()])
-    )
+def test_a_clock_that_is_set_makes_a_gap_and_loses_nothing(jump_s, tmp_path, caplog):
+    path, half = tmp_path / "r.log", CYCLES // 2 * 1e-3 - 1e-4
+    lines = [line._replace(time_s=line.time_s + (jump_s if line.time_s > half else 0)) for line in bus()]
+    path.write_bytes(candump(lines))
     with caplog.at_level(logging.WARNING, "drivelink.recording"):
-        samples = [
-            one.tick.sample
-            for one in open_playback(path, parse(joint_text("a", 1)), tmp_path)
-            if one.tick.sample
-        ]
-    motor, _, _ = truth(1)
-    found = [one.motor_position_rad[0] for one in samples]
-    assert found == pytest.approx((motor * 2.0 * math.pi / COUNTS).tolist(), rel=1e-12, abs=1e-15)
+        played = list(open_playback(path, parse(joint_text("a", 1)), tmp_path))
+    samples = [one.tick.sample for one in played if one.tick.sample]
+    motor = truth(1)[0] * 2.0 * math.pi / COUNTS
+    assert [one.motor_position_rad[0] for one in samples] == pytest.approx(
+        motor.tolist(), rel=1e-12, abs=1e-15
+    )
     steps = np.diff([one.sequence for one in samples])
     expected = jump_s * 1e3 + 1 if jump_s > 0 else 1000
-    assert np.count_nonzero(steps != 1) == 1 and steps.max() == pytest.approx(
-        expected, rel=1e-4, abs=2
-    )  # 200 SYNCs with stamps in microseconds give the period to 1e-4 of it
-    if jump_s < 0:
-        assert "the stamps jump back by" in caplog.text
+    assert np.count_nonzero(steps != 1) == 1
+    # 200 SYNCs with stamps in microseconds give the period to 1e-4 of it.
+    assert steps.max() == pytest.approx(expected, rel=1e-4, abs=2)
+    assert jump_s > 0 or "the stamps jump back by" in caplog.text
 
 
 @pytest.mark.parametrize(
-    ("spoil", "mapped", "said"),
+    ("without", "mapped", "said"),
     [
-        (lambda lines: lines, False, ("mapping", "tpdo")),
-        (lambda lines: [line for line in lines if line.can_id != 0x080], True, ("SYNC frames (0x080)", "record")),
-        (
-            lambda lines: [line for line in lines if line.can_id not in (0x181, 0x281)],
-            True,
-            ("0x181 of node 1", "got none"),
-        ),
+        ((), False, ("mapping", "tpdo")),
+        ((0x080,), True, ("SYNC frames (0x080)", "record")),
+        ((0x181, 0x281), True, ("0x181 of node 1", "got none")),
     ],
-)  # fmt: skip
-def test_what_is_missing_is_one_line_that_says_how_to_give_it(
-    spoil: Callable[[list[Line]], list[Line]], mapped: bool, said: tuple[str, ...], tmp_path: Path
-) -> None:
+)
+def test_what_is_missing_is_one_line_that_says_how_to_give_it(without, mapped, said, tmp_path):
     path = tmp_path / "r.log"
-    path.write_bytes(candump(spoil(bus())))
+    path.write_bytes(candump([line for line in bus() if line.can_id not in without]))
     with pytest.raises(DrivelinkError) as caught:
         read(path, parse(joint_text("a", 1, mapped)))
-    assert "\n" not in str(caught.value) and all(word in str(caught.value) for word in said), str(
-        caught.value
-    )
+    text = str(caught.value)
+    assert "\n" not in text and all(word in text for word in said), text
 
 
-def test_a_trace_of_an_unknown_version_is_not_guessed_at(tmp_path: Path) -> None:
+def test_a_trace_of_an_unknown_version_is_not_guessed_at(tmp_path):
     path = tmp_path / "r.trc"
     path.write_bytes(peak_trc(bus(), "2.1").replace(b"=2.1", b"=3.0"))
     with pytest.raises(DrivelinkError, match=r"expected a PCAN trace of version 1\.0, .*, got '3\.0'"):

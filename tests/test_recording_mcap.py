@@ -10,8 +10,8 @@ import signal
 import struct
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -22,6 +22,7 @@ from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording import read
+from drivelink.recording.canlog import read_frames
 from drivelink.recording.columns import record_from_columns
 from drivelink.recording.formats import open_sink
 from drivelink.recording.foxglove import write_layouts
@@ -47,14 +48,8 @@ def estimate(k: int, status: int = 3) -> EstimateMessage:
 
 
 def external(k: int) -> ExternalMessage:
-    valid = k >= 5
-    return ExternalMessage(
-        k,
-        BEGIN_NS + k * 1_000_000,
-        (1 if valid else 0) | (2 if k >= 400 else 0),
-        k / 7 if valid else math.nan,
-        0.5,
-    )
+    status = (1 if k >= 5 else 0) | (2 if k >= 400 else 0)
+    return ExternalMessage(k, BEGIN_NS + k * 1_000_000, status, k / 7 if k >= 5 else math.nan, 0.5)
 
 
 def record(path: Path, n: int = 500, close: bool = True) -> None:
@@ -80,93 +75,83 @@ def bits(one: Sample) -> bytes:
     return struct.pack(f"<q{len(values)}d", one.sequence, *values)
 
 
-def test_samples_come_back_bit_for_bit(tmp_path: Path) -> None:
-    path = tmp_path / "r.mcap"
-    record(path)
+@pytest.fixture
+def path(tmp_path):
+    record(tmp_path / "r.mcap")
+    return tmp_path / "r.mcap"
+
+
+def test_samples_come_back_bit_for_bit(path, tmp_path, caplog):
     back = [cycle.sample for cycle in recorded_cycles(path, 1)]
     assert [bits(one) for one in back if one] == [bits(sample(k)) for k in range(500)]
-    carried = joint_of(path, None)
+    carried, whole = joint_of(path, None), read(path, JOINT)
     assert (carried.text, carried.folder) == (TEXT, tmp_path)
+    assert whole.period_s == JOINT.bus.period_s and len(whole) == 500
+    assert np.array_equal(whole.motor_torque_nm[:, 0], [sample(k).motor_torque_nm[0] for k in range(500)])
+    with pytest.raises(RecordingError, match="has more motors than the joint file"):
+        list(recorded_cycles(path, 0))
+    columns = {name: np.sin(0.1 * np.arange(200.0)) for name in TWO} | {"time_s": 1e-3 * np.arange(200.0)}
+    record_from_columns(columns, "two.csv", JOINT)
+    assert "two.csv: has a second motor" in caplog.text
 
 
-def test_a_record_of_it_is_that_of_its_samples(tmp_path: Path) -> None:
-    path = tmp_path / "r.mcap"
-    record(path)
-    back = read(path, JOINT)
-    assert back.period_s == JOINT.bus.period_s and len(back) == 500
-    assert np.array_equal(back.motor_torque_nm[:, 0], [sample(k).motor_torque_nm[0] for k in range(500)])
+TWO = ("motor1_position_rad", "motor1_torque_nm", "motor2_position_rad", "link_position_rad")
 
 
-def check(value: Any, schema: dict[str, Any], where: str) -> None:
+TYPES = {
+    "object": dict, "integer": int, "string": str, "boolean": bool, "number": (int, float), "null": type(None),
+}  # fmt: skip
+
+
+def check(value, schema, where):
     """What our schemas use of JSON schema: type, properties, required."""
-    types = {
-        "object": dict,
-        "integer": int,
-        "string": str,
-        "boolean": bool,
-        "number": (int, float),
-        "null": type(None),
-    }
     wanted = schema["type"] if isinstance(schema["type"], list) else [schema["type"]]
-    assert any(isinstance(value, types[name]) for name in wanted), where  # type: ignore[arg-type]
+    assert any(isinstance(value, TYPES[name]) for name in wanted), where
     if isinstance(value, dict):
         assert set(schema.get("required", ())) <= set(value), where
         for name, inner in schema.get("properties", {}).items():
             check(value[name], inner, f"{where}.{name}")
 
 
-def strict(text: str) -> Any:
-    """JSON as other languages read it: no NaN, no Infinity."""
-
-    def refuse(name: str) -> Any:
-        raise AssertionError(f"{name} is no JSON")
-
-    return json.loads(text, parse_constant=refuse)
-
-
-def test_an_independent_reader_finds_channels_schemas_and_messages_that_obey_them(tmp_path: Path) -> None:
-    path = tmp_path / "r.mcap"
-    record(path)
-    counts: dict[str, int] = {}
+def test_an_independent_reader_finds_channels_schemas_and_messages_that_obey_them(path):
+    counts, refuse = Counter(), lambda name: pytest.fail(f"{name} is no JSON")
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
-        summary = reader.get_summary()
+        assert reader.get_summary().statistics.message_start_time == BEGIN_NS
         for schema, channel, message in reader.iter_messages():
-            assert schema is not None and schema.encoding == "jsonschema"
-            assert channel.message_encoding == "json"
-            check(strict(message.data.decode()), json.loads(schema.data), channel.topic)
-            counts[channel.topic] = counts.get(channel.topic, 0) + 1
-    assert counts == {
-        "/elbow/sample": 500, "/elbow/estimate": 500, "/elbow/external": 500, "/elbow/can": 500, "/elbow/status": 5, "/elbow/joint": 1,
-        "/elbow/log": 2,
-    }  # fmt: skip
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            value = json.loads(message.data, parse_constant=refuse)  # as other languages read it
+            check(value, json.loads(schema.data), channel.topic)
+            counts[channel.topic] += 1
+    topics = {"sample": 500, "estimate": 500, "external": 500, "can": 500, "status": 5, "joint": 1, "log": 2}
+    assert counts == {f"/elbow/{topic}": count for topic, count in topics.items()}
     described = json.loads(message_schema("estimate", 1))["properties"]
-    assert described["motor1_stiffness_nm_rad"]["unit"] == "N·m/rad"
     assert (
-        described["valid"]["type"] == "boolean"
-        and json.loads(message_schema("log", 1))["title"] == "foxglove.Log"
+        described["motor1_stiffness_nm_rad"]["unit"] == "N·m/rad" and described["valid"]["type"] == "boolean"
     )
-    assert summary is not None and summary.statistics is not None
-    assert summary.statistics.message_start_time == BEGIN_NS
+    assert json.loads(message_schema("log", 1))["title"] == "foxglove.Log"
+    drawn = [json.loads(m.data) for m in read_messages(path, frozenset({"estimate"}))][:6]
+    assert drawn[0]["motor1_stiffness_low_nm_rad"] is None  # without a standard deviation
+    for part in ("", "motor1_"):
+        value, std = drawn[5][f"{part}stiffness_nm_rad"], drawn[5][f"{part}stiffness_std_nm_rad"]
+        assert drawn[5][f"{part}stiffness_low_nm_rad"] == pytest.approx(value - SIGMA_95 * std)
+        assert drawn[5][f"{part}stiffness_high_nm_rad"] == pytest.approx(value + SIGMA_95 * std)
 
 
-def test_without_its_end_everything_flushed_is_there_for_both_readers(tmp_path: Path) -> None:
-    path = tmp_path / "r.mcap"
+def test_without_its_end_everything_flushed_is_there_for_both_readers_and_that_is_said_once(tmp_path, caplog):
+    path, found = tmp_path / "r.mcap", 0
     record(path, close=False)
-    assert sum(m.topic == "/elbow/sample" for m in read_messages(path)) == 500
-    found = 0
+    for _ in range(3):
+        assert sum(m.topic == "/elbow/sample" for m in read_messages(path)) == 500
+    assert caplog.messages.count(f"{path}: truncated or damaged: read up to the damage") == 1
     with path.open("rb") as file, pytest.raises(Exception):  # noqa: B017  (the end is missing, and it says so)
         for _ in NonSeekingReader(file).iter_messages(log_time_order=False):
             found += 1
     assert found == 2008
 
 
-def test_cut_off_anywhere_it_gives_what_is_whole(tmp_path: Path) -> None:
-    path = tmp_path / "r.mcap"
-    record(path)
-    whole = path.read_bytes()
-    rng = random.Random(3)
-    before = 0
+def test_cut_off_anywhere_it_gives_what_is_whole(path):
+    whole, rng, before = path.read_bytes(), random.Random(3), 0
     for size in sorted(rng.randrange(3000, len(whole)) for _ in range(25)):
         path.write_bytes(whole[:size])
         found = [m for m in read_messages(path) if m.topic == "/elbow/sample"]
@@ -175,7 +160,7 @@ def test_cut_off_anywhere_it_gives_what_is_whole(tmp_path: Path) -> None:
     assert before >= 400
 
 
-def test_a_cycle_that_was_carried_on_is_a_cycle_without_sample(tmp_path: Path) -> None:
+def test_a_cycle_that_was_carried_on_is_a_cycle_without_sample(tmp_path):
     path = tmp_path / "r.mcap"
     sink = open_sink(path, JOINT)
     stale = int(Status.STALE | Status.BUS_FAULT)
@@ -190,15 +175,12 @@ def test_a_cycle_that_was_carried_on_is_a_cycle_without_sample(tmp_path: Path) -
     assert cycles[120].flags == Status.BUS_FAULT and cycles[200].flags == Status.DRIVE_FAULT
 
 
-def test_what_is_no_mcap_file_is_one_clear_line(tmp_path: Path) -> None:
-    path = tmp_path / "r.mcap"
-    path.write_bytes(b"something else entirely")
-    with pytest.raises(RecordingError, match="expected an MCAP file"):
-        read(path, JOINT)
-    path.unlink()
-    record(path, n=0)
-    with pytest.raises(RecordingError, match="no samples in it"):
-        read(path, JOINT)
+def test_what_is_no_mcap_file_is_one_clear_line(tmp_path):
+    (tmp_path / "x.mcap").write_bytes(b"something else entirely")
+    record(tmp_path / "r.mcap", n=0)
+    for name, line in (("x.mcap", "expected an MCAP file"), ("r.mcap", "no samples in it")):
+        with pytest.raises(RecordingError, match=line):
+            read(tmp_path / name, JOINT)
 
 
 WRITER = """
@@ -225,26 +207,29 @@ except RecordingError as error:
 """
 
 
-def writer(path: Path, before: str = "") -> subprocess.Popen[str]:
+def writer(path, before=""):
     tests = str(Path(__file__).parent)
+    command = [sys.executable, "-c", before + WRITER.format(tests=tests), str(path)]
+    environment = os.environ | {"PYTHONPATH": str(Path(tests).parent)}
     return subprocess.Popen(
-        [sys.executable, "-c", before + WRITER.format(tests=tests), str(path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": str(Path(tests).parent)},
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     )
 
 
-SUFFIXES = [
-    ".mcap",
-    pytest.param(".csv", marks=pytest.mark.slow),
-    pytest.param(".blf", marks=pytest.mark.slow),
-]
+def count(path):
+    """Samples, or frames, in a recording."""
+    if path.suffix == ".mcap":
+        return sum(m.topic == "/elbow/sample" for m in read_messages(path))
+    if path.suffix == ".csv":
+        return len(read(path, parse(TEXT + '[motor.transmission]\nmodel = "none"\n')))
+    return sum(1 for _ in read_frames(path))
+
+
+SUFFIXES = [".mcap", *(pytest.param(suffix, marks=pytest.mark.slow) for suffix in (".csv", ".blf"))]
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_killed_recording_is_there_up_to_the_last_flush(suffix: str, tmp_path: Path) -> None:
+def test_a_killed_recording_is_there_up_to_the_last_flush(suffix, tmp_path):
     path = tmp_path / f"r{suffix}"
     process = writer(path)
     assert process.stdout is not None
@@ -255,7 +240,7 @@ def test_a_killed_recording_is_there_up_to_the_last_flush(suffix: str, tmp_path:
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_full_disk_is_one_line_and_a_file_that_is_whole(suffix: str, tmp_path: Path) -> None:
+def test_a_full_disk_is_one_line_and_a_file_that_is_whole(suffix, tmp_path):
     path = tmp_path / f"r{suffix}"
     # No more than 40 kB in a file: the write fails as on a full disk (EFBIG instead of ENOSPC).
     limit = "import resource, signal\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
@@ -269,42 +254,10 @@ def test_a_full_disk_is_one_line_and_a_file_that_is_whole(suffix: str, tmp_path:
     assert count(path) == int(whole) > 0
 
 
-def count(path: Path) -> int:
-    """Samples, or frames, in a recording."""
-    from drivelink.recording.canlog import read_frames
-
-    if path.suffix == ".mcap":
-        return sum(m.topic == "/elbow/sample" for m in read_messages(path))
-    if path.suffix == ".csv":
-        return len(read(path, parse(TEXT + '[motor.transmission]\nmodel = "none"\n')))
-    return sum(1 for _ in read_frames(path))
-
-
-def test_an_estimate_says_what_a_view_draws(tmp_path: Path) -> None:
-    path = tmp_path / "r.mcap"
-    sink = open_sink(path, JOINT)
-    one = (TransmissionEstimate(1.0, 150.0, 2.0, 0.01),)
-    for k, status in ((1, 3), (2, 2)):
-        sink.estimate(EstimateMessage(k, BEGIN_NS + k, status, 1.0, 150.0, 2.0, one))
-    sink.estimate(estimate(3))  # without a standard deviation
-    sink.close()
-    first, second, third = (json.loads(m.data) for m in read_messages(path, frozenset({"estimate"})))
-    assert third["motor1_stiffness_low_nm_rad"] is None
-    assert (first["valid"], second["valid"]) == (1, 0)
-    for part in ("", "motor1_"):
-        value, std = first[f"{part}stiffness_nm_rad"], first[f"{part}stiffness_std_nm_rad"]
-        assert first[f"{part}stiffness_low_nm_rad"] == pytest.approx(value - SIGMA_95 * std)
-        assert first[f"{part}stiffness_high_nm_rad"] == pytest.approx(value + SIGMA_95 * std)
-
-
 @pytest.mark.parametrize("motors", [1, 2])
-def test_the_layouts_for_foxglove_and_plotjuggler_plot_what_is_recorded(motors: int, tmp_path: Path) -> None:
-    joint = (
-        JOINT
-        if motors == 1
-        else parse('name = "elbow"\narrangement = "antagonistic"\n' + "[[motor]]\ninertia_kg_m2 = 0.1\n" * 2)
-    )
-    fox, jug = write_layouts(joint, tmp_path / "views")
+def test_the_layouts_for_foxglove_and_plotjuggler_plot_what_is_recorded(motors, tmp_path):
+    two = 'name = "elbow"\narrangement = "antagonistic"\n' + "[[motor]]\ninertia_kg_m2 = 0.1\n" * 2
+    fox, jug = write_layouts(JOINT if motors == 1 else parse(two), tmp_path / "views")
     fields = {
         f"/elbow/{topic}/{name}"
         for topic in ("sample", "estimate")
@@ -320,33 +273,3 @@ def test_the_layouts_for_foxglove_and_plotjuggler_plot_what_is_recorded(motors: 
         placed.append(rest["first"])
         rest = rest["second"]
     assert [*placed, rest] == list(layout["configById"])
-
-
-def test_a_file_that_is_cut_off_is_one_warning_however_often_it_is_read(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "cut.mcap"
-    record(path, close=False)
-    for _ in range(3):
-        list(read_messages(path))
-    assert [entry.getMessage() for entry in caplog.records].count(
-        f"{path}: truncated or damaged: read up to the damage"
-    ) == 1
-
-
-def test_a_recording_of_more_motors_than_the_joint_has_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "two.mcap"
-    record(path)
-    motors = len(JOINT.motor)
-    with pytest.raises(RecordingError, match="has more motors than the joint file"):
-        list(recorded_cycles(path, motors - 1))
-    assert len(list(recorded_cycles(path, motors))) == 500
-
-
-def test_of_a_second_motor_that_the_joint_has_not_a_warning_speaks(caplog: pytest.LogCaptureFixture) -> None:
-    k = np.arange(200, dtype=float)
-    names = ("motor1_position_rad", "motor1_torque_nm", "motor2_position_rad", "link_position_rad")
-    columns = {"time_s": 1e-3 * k, **{name: np.sin(0.1 * k) for name in names}}
-    alone = parse('name = "elbow"\nmotor = [{ inertia_kg_m2 = 0.1 }]\n')
-    record_from_columns(columns, "two.csv", alone)
-    assert "two.csv: has a second motor" in caplog.text

@@ -17,15 +17,13 @@ from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.jointfile.apply_diagnosis import floor_entry, make_model_monitor
 from drivelink.output.numbers import Units
-from estimator.model import JointModel, Motor, Transmission
 from estimator.sample import Record
 
 JOINT = fleetkit.JOINT.format(name="elbow")
-ERROR = {"before_rms_nm", "after_rms_nm", "before_relative", "after_relative"}
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("diagnose")
     effects = [{}, {"coulomb_nm": 0.4}, {"late_s": 0.004}, {"bump_nm": 1.0}]
     for name, record in zip(("clean", "coulomb", "late", "bump"), kit.World(effects).run(), strict=True):
@@ -42,26 +40,20 @@ def _diagnose(folder: Path, name: str, joint: str = "joint.toml", *more: str) ->
     return json.loads((out / "report.json").read_text(encoding="utf-8"))  # type: ignore[no-any-return]
 
 
-def test_report_json_is_as_promised(folder: Path) -> None:
+def test_report_json_is_as_promised(folder):
     report = _diagnose(folder, "coulomb")
-    assert report["schema"] == "drivelink.diagnosis/1"
-    assert report["verdict"] == "effect"
+    assert (report["schema"], report["verdict"]) == ("drivelink.diagnosis/1", "effect")
     assert report["bandwidth_hz"] > 0
-    effect = report["effects"][0]
+    effect, error = report["effects"][0], report["error"]
     assert {"name", "location", "parameters", "std", "alternatives"} <= set(effect)
     assert (effect["name"], effect["location"]) == ("coulomb_friction", "motor")
-    assert set(report["error"]) == {"train", "validation"}
-    assert set(report["error"]["train"]) == set(report["error"]["validation"]) == ERROR
+    names = {f"{when}_{what}" for when in ("before", "after") for what in ("rms_nm", "relative")}
+    assert {name: set(error[name]) for name in error} == {"train": names, "validation": names}
 
 
-@pytest.mark.parametrize(
-    ("name", "effect"),
-    [
-        pytest.param("coulomb", "coulomb_friction", marks=pytest.mark.slow),
-        pytest.param("late", "encoder_delay", marks=pytest.mark.slow),
-    ],
-)
-def test_the_written_joint_file_knows_the_effect_and_its_floor(folder: Path, name: str, effect: str) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "effect"), [("coulomb", "coulomb_friction"), ("late", "encoder_delay")])
+def test_the_written_joint_file_knows_the_effect_and_its_floor(folder, name, effect):
     better = f"{name}-better.toml"
     _diagnose(folder, name, "joint.toml", "--write", str(folder / better))
     joint = jointfile.load(folder / better)
@@ -71,32 +63,40 @@ def test_the_written_joint_file_knows_the_effect_and_its_floor(folder: Path, nam
     assert _diagnose(folder, name, better)["verdict"] == "sufficient"
 
 
-def test_an_unlisted_effect_comes_with_its_curve(folder: Path) -> None:
+def test_an_unlisted_effect_comes_with_its_curve(folder):
     effect = _diagnose(folder, "bump")["effects"][0]
     assert (effect["name"], effect["location"], effect["coordinates"]) == ("unlisted", "motor", ["position"])
     assert len(effect["curve"]["position"]) == len(effect["curve"]["torque_nm"]) > 100
 
 
-def test_json_is_pure_and_what_the_file_says(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_is_pure_and_a_page_without_a_curve_has_no_empty_section(folder, capsys):
     report = _diagnose(folder, "clean", "joint.toml", "--json")
     assert json.loads(capsys.readouterr().out) == report
+    page = (folder / "clean-joint.toml" / "report.html").read_text(encoding="utf-8")
+    assert "What reveals it" not in page
 
 
-def test_the_report_has_units_bands_the_winner_and_what_is_left(folder: Path) -> None:
+def test_the_report_is_self_contained_and_has_the_verdict_units_bands_the_winner_and_what_is_left(folder):
     _diagnose(folder, "coulomb")
     page = (folder / "coulomb-joint.toml" / "report.html").read_text(encoding="utf-8")
-    assert "of the torque (" in page and "rms) stays unexplained" in page
-    assert page.count("▶ ") == 2  # the one that was chosen, and what the mark means
+    for part in (
+        "The model lacks Coulomb friction (motor)", "of the torque (", "rms) stays unexplained", "What reveals it",
+        "asymmetric friction alone leaves less: an effect with more freedom", ">refitted</text>",
+        "Stiffness of motor 1's transmission, with 95 % bands", "prefers-color-scheme: dark", "currentColor",
+    ):  # fmt: skip
+        assert part in page, part
+    for foreign in ("#ffffff", 'src="http', 'href="http', "@import", "<script"):
+        assert foreign not in page
+    assert (
+        page.count("<svg") >= 3 and page.count("▶ ") == 2
+    )  # the one that was chosen, and what the mark means
     assert re.search(r'<tr class="chosen"><th>▶ Coulomb friction</th><td>(0\.9\d|1\.00)</td>', page)
-    assert "asymmetric friction alone leaves less: an effect with more freedom" in page
-    assert "Stiffness of motor 1's transmission, with 95 % bands" in page and ">refitted</text>" in page
     assert re.search(r"<th>torque_<wbr>nm</th><td>0\.\d+</td><td>\S+</td><td>N·m</td>", page)
     assert re.search(r"<th>k_<wbr>nm_<wbr>rad</th><td>\S+</td><td>\S+</td><td>N·m/rad</td>", page)
-    assert "prefers-color-scheme: dark" in page and "currentColor" in page and "#ffffff" not in page
 
 
 @pytest.mark.slow
-def test_of_a_linear_axis_the_report_speaks_of_newtons_and_metres(folder: Path) -> None:
+def test_of_a_linear_axis_the_report_speaks_of_newtons_and_metres(folder):
     (folder / "slide.toml").write_text(JOINT.replace("[[motor]]", 'axis = "linear"\n[[motor]]', 1))
     _diagnose(folder, "coulomb", "slide.toml")
     page = (folder / "coulomb-slide.toml" / "report.html").read_text(encoding="utf-8")
@@ -105,44 +105,18 @@ def test_of_a_linear_axis_the_report_speaks_of_newtons_and_metres(folder: Path) 
     assert "N·m" not in page and "/ rad" not in page and "m/s" in page
 
 
-def test_the_page_is_self_contained_and_says_the_verdict(folder: Path) -> None:
-    _diagnose(folder, "coulomb")
-    page = (folder / "coulomb-joint.toml" / "report.html").read_text(encoding="utf-8")
-    assert "The model lacks Coulomb friction (motor)" in page
-    assert page.count("<svg") >= 3
-    for foreign in ('src="http', 'href="http', "@import", "<script"):
-        assert foreign not in page
-
-
-def test_a_page_without_a_curve_has_no_empty_section(folder: Path) -> None:
-    _diagnose(folder, "clean", "joint.toml", "--json")
-    _diagnose(folder, "coulomb")
-    for name, there in (("clean", False), ("coulomb", True)):
-        page = (folder / f"{name}-joint.toml" / "report.html").read_text(encoding="utf-8")
-        assert ("What reveals it" in page) is there
-
-
 @pytest.mark.slow
-def test_a_fitted_joint_file_is_calibrated_and_watched(folder: Path) -> None:
-    fitted = folder / "healthy.toml"
-    arguments = [
-        "fit",
-        str(folder / "clean.csv"),
-        "--joint",
-        str(folder / "joint.toml"),
-        "--write",
-        str(fitted),
-    ]
-    assert main(arguments) == 0
-    joint = jointfile.load(fitted)
-    assert joint.link.dynamics is not None
+def test_a_fitted_joint_file_is_calibrated_and_watched(folder):
+    clean, declared, fitted = (str(folder / name) for name in ("clean.csv", "joint.toml", "healthy.toml"))
+    assert main(["fit", clean, "--joint", declared, "--write", fitted]) == 0
+    joint = jointfile.load(folder / "healthy.toml")
     # The declared numbers are exact; noise moves them by less than a percent.
     assert joint.link.dynamics.inertia_kg_m2 == pytest.approx(kit.LINK_INERTIA, rel=0.01)
     assert make_model_monitor(joint) is not None
     assert _diagnose(folder, "clean", "healthy.toml")["verdict"] == "sufficient"
 
 
-def test_what_cannot_be_diagnosed_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_diagnosed_is_one_line(folder, capsys):
     text = (folder / "clean.csv").read_text(encoding="utf-8").splitlines()
     (folder / "short.csv").write_text("\n".join(text[:900]) + "\n", encoding="utf-8")
     arguments = ["diagnose", str(folder / "short.csv"), "--joint", str(folder / "joint.toml")]
@@ -152,18 +126,16 @@ def test_what_cannot_be_diagnosed_is_one_line(folder: Path, capsys: pytest.Captu
     assert error.count("\n") == 1
 
 
-def test_every_coefficient_of_a_polynomial_has_its_unit() -> None:
+def test_every_coefficient_of_a_polynomial_has_its_unit():
     text = Units(linear=False).value("coefficients_nm_rad", tuple(float(k) for k in range(1, 9)), None)
     units = ["rad", "rad³", "rad⁵", "rad⁷", "rad⁹", "rad¹¹", "rad¹³", "rad¹⁵"]
     assert text == ", ".join(f"{k} N·m/{unit}" for k, unit in enumerate(units, start=1))
 
 
-def test_a_baseline_that_cannot_be_measured_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
-    k, zeros = np.arange(50), np.zeros((50, 1))
-    record = Record(
-        period_s=1e-3, sequence=k, motor_position_rad=zeros, motor_torque_nm=zeros, link_position_rad=1e-3 * k
-    )
-    known = Transmission(model="linear", parameters={"k_nm_rad": 100.0})
-    model = JointModel(arrangement="single", motors=(Motor(inertia_kg_m2=0.1, transmission=known),))
+def test_a_baseline_that_cannot_be_measured_is_a_warning(caplog):
+    k, still = np.arange(50), np.zeros((50, 1))
+    columns = {"motor_position_rad": still, "motor_torque_nm": still, "link_position_rad": 1e-3 * k}
+    record = Record(period_s=1e-3, sequence=k, **columns)
+    model = joints.joint_model(0.1, 0.0, model="linear", order=None, parameters={"k_nm_rad": 100.0})
     assert floor_entry(record, model, 1.0) == {}
     assert "the daemon cannot raise the model alarm: " in caplog.text

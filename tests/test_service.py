@@ -30,58 +30,49 @@ NETWORK = Path("etc/systemd/network/80-drivelink-can0.network")
 
 
 @pytest.fixture
-def joint(tmp_path: Path) -> Path:
-    path = tmp_path / "elbow.toml"
-    path.write_text(JOINT.format(interface="socketcan", channel="can0"), encoding="utf-8")
+def joint(tmp_path):
+    return written(tmp_path)
+
+
+def written(folder, interface="socketcan", channel="can0"):
+    path = folder / "elbow.toml"
+    path.write_text(JOINT.format(interface=interface, channel=channel), encoding="utf-8")
     return path
+
+
+def files_in(root):
+    return [path for path in root.rglob("*") if path.is_file()]
 
 
 def service(*words: object) -> int:
     return cli.main(["service", *map(str, words)])
 
 
-def test_install_writes_the_unit_and_the_interface_and_uninstall_leaves_nothing(
-    joint: Path, tmp_path: Path
-) -> None:
-    root = tmp_path / "root"
-    assert service("install", joint, "--root", root) == 0
+@pytest.mark.parametrize("moved", [(), ("--channel", "can1")])
+def test_install_writes_the_unit_and_the_interface_and_uninstall_leaves_nothing(joint, tmp_path, moved):
+    root, channel = tmp_path / "root", moved[1] if moved else "can0"
+    for _ in range(2):  # the same again
+        assert service("install", joint, "--root", root, *moved) == 0
     unit = (root / UNIT).read_text()
-    assert f" run {joint}" in unit and f"WorkingDirectory={tmp_path}" in unit and "{{" not in unit
-    assert "After=network.target sys-subsystem-net-devices-can0.device" in unit
-    network = (root / NETWORK).read_text()
-    assert "Name=can0" in network and "BitRate=500000" in network and "RestartSec=100ms" in network
-    assert service("install", joint, "--root", root) == 0  # the same again
-    assert service("uninstall", joint, "--root", root) == 0
-    assert [path for path in root.rglob("*") if path.is_file()] == []
-
-
-def test_the_bus_of_the_command_line_is_the_service_s(joint: Path, tmp_path: Path) -> None:
-    root, moved = tmp_path / "root", ("--channel", "can1")
-    assert service("install", joint, "--root", root, *moved) == 0
-    unit = (root / UNIT).read_text()
-    assert f" run {joint} --channel can1\n" in unit
-    assert "sys-subsystem-net-devices-can1.device" in unit
-    assert "Name=can1" in (root / "etc/systemd/network/80-drivelink-can1.network").read_text()
+    assert f" run {' '.join([str(joint), *moved])}\n" in unit and f"WorkingDirectory={tmp_path}" in unit
+    assert f"After=network.target sys-subsystem-net-devices-{channel}.device" in unit and "{{" not in unit
+    network = (root / f"etc/systemd/network/80-drivelink-{channel}.network").read_text()
+    assert f"Name={channel}" in network and "BitRate=500000" in network and "RestartSec=100ms" in network
     assert service("uninstall", joint, "--root", root, *moved) == 0
-    assert [path for path in root.rglob("*") if path.is_file()] == []
+    assert files_in(root) == []
     assert service("install", joint, "--root", root, "--channel", "can 1") == 2
 
 
-def test_without_systemd_nothing_is_written(
-    joint: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_systemd_nothing_is_written(joint, monkeypatch, capsys):
+    missing = subprocess.CompletedProcess((), 1, "", "no systemd")
     monkeypatch.setattr("os.geteuid", lambda: 0)
-    monkeypatch.setattr(
-        "subprocess.run", lambda *_, **__: subprocess.CompletedProcess((), 1, "", "no systemd")
-    )
+    monkeypatch.setattr("subprocess.run", lambda *_, **__: missing)
     monkeypatch.setattr(Path, "write_text", lambda *_, **__: pytest.fail("something was written"))
     assert service("install", joint) == 1
     assert capsys.readouterr().err == "drivelink service: systemctl daemon-reload: no systemd\n"
 
 
-def test_what_somebody_has_changed_is_replaced_only_when_asked(
-    joint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_somebody_has_changed_is_replaced_only_when_asked(joint, tmp_path, capsys):
     root = tmp_path / "root"
     service("install", joint, "--root", root)
     (root / UNIT).write_text("mine")
@@ -91,7 +82,7 @@ def test_what_somebody_has_changed_is_replaced_only_when_asked(
     assert (root / UNIT).read_text() != "mine"
 
 
-def test_a_second_joint_on_the_interface_keeps_its_network_file(joint: Path, tmp_path: Path) -> None:
+def test_a_second_joint_on_the_interface_keeps_its_network_file(joint, tmp_path):
     root, other = tmp_path / "root", tmp_path / "knee.toml"
     other.write_text(joint.read_text().replace("elbow", "knee"))
     service("install", joint, "--root", root)
@@ -111,35 +102,21 @@ def test_a_second_joint_on_the_interface_keeps_its_network_file(joint: Path, tmp
         ("socketcan", "can0", ["--credential", "key"], "expected NAME=FILE"),
     ],
 )
-def test_what_cannot_be_a_service_is_one_line(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    interface: str,
-    channel: str,
-    words: list[str],
-    message: str,
-) -> None:
-    path = tmp_path / "elbow.toml"
-    path.write_text(JOINT.format(interface=interface, channel=channel), encoding="utf-8")
-    assert service("install", path, "--root", tmp_path / "root", *words) == 2
+def test_what_cannot_be_a_service_is_one_line(tmp_path, capsys, interface, channel, words, message):
+    path, root = written(tmp_path, interface, channel), tmp_path / "root"
+    assert service("install", path, "--root", root, *words) == 2
     error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-    assert not (tmp_path / "root").exists()
+    assert message in error and error.count("\n") == 1 and not root.exists()
 
 
-def test_a_home_installation_is_let_in_and_keys_come_as_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_home_installation_is_let_in_and_keys_come_as_credentials(monkeypatch):
     """The unit sees nothing below /home but these, and they read-only."""
     monkeypatch.setattr("sys.prefix", "/home/eva/venv")
     monkeypatch.setattr("sys.base_prefix", "/home/eva/.pyenv/versions/3.12")
     text = JOINT.format(interface="slcan", channel="/dev/ttyACM0")
     path = Path("/home/eva/robots/elbow.toml")
-    made = installation(
-        parse(text),
-        path,
-        Path("/home/eva/venv/bin/drivelink"),
-        allow=["10.0.0.0/24"],
-        credentials=["daemon.key=/etc/ssl/private/daemon.key"],
-    )
+    more = {"allow": ["10.0.0.0/24"], "credentials": ["daemon.key=/etc/ssl/private/daemon.key"]}
+    made = installation(parse(text), path, Path("/home/eva/venv/bin/drivelink"), **more)
     (unit,) = made.files.values()
     bound = re.findall(r"^BindReadOnlyPaths=(.*)$", unit, re.MULTILINE)
     assert {"/home/eva/venv", "/home/eva/.pyenv/versions/3.12", "/home/eva/robots"} <= set(bound)
@@ -151,24 +128,13 @@ def test_a_home_installation_is_let_in_and_keys_come_as_credentials(monkeypatch:
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
 @pytest.mark.parametrize(("interface", "channel"), [("socketcan", "can0"), ("slcan", "/dev/ttyACM0")])
-def test_systemd_finds_the_unit_right_and_little_exposed(
-    tmp_path: Path, interface: str, channel: str
-) -> None:
+def test_systemd_finds_the_unit_right_and_little_exposed(tmp_path, interface, channel):
     """At most 2.0 of 10, with what a daemon needs: real-time scheduling, CAN and IP sockets."""
-    path = tmp_path / "elbow.toml"
-    path.write_text(JOINT.format(interface=interface, channel=channel), encoding="utf-8")
+    path = written(tmp_path, interface, channel)
     service("install", path, "--root", tmp_path, "--credential", f"key={path}")
-    unit = str(tmp_path / UNIT)
-    verified = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", unit], capture_output=True, text=True, check=False
-    )
-    assert verified.returncode == 0, verified.stderr
-    done = subprocess.run(
-        ["systemd-analyze", "security", "--offline=true", "--threshold=20", unit],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout
+    for words in (["verify", "--man=no"], ["security", "--offline=true", "--threshold=20"]):
+        command = ["systemd-analyze", *words, str(tmp_path / UNIT)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
     level = re.search(r"exposure level .*: ([\d.]+)", done.stdout)
     assert level is not None and float(level[1]) <= 2.0

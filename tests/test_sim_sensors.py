@@ -40,19 +40,15 @@ def test_positions_are_whole_counts_of_the_motor_shaft():
     assert np.std(error) == pytest.approx(step / math.sqrt(12.0), rel=0.05)  # uniform within a count
 
 
-def test_velocity_comes_in_whole_revolutions_per_minute():
+def test_velocity_comes_in_whole_revolutions_per_minute_and_its_filter_lags():
     r = recorded(DRIVE)
     rpm = r["motor1_velocity_rad_s"] * 50.0 * 60.0 / (2.0 * math.pi)
     assert rpm == pytest.approx(np.round(rpm), abs=1e-9)
     assert np.abs(r["motor1_velocity_rad_s"] - r["truth_motor1_velocity_rad_s"]).max() < 0.11 / 50.0
-
-
-def test_a_velocity_filter_lags():
     r = recorded(replace(DRIVE, velocity_filter_s=0.005, velocity_resolution_rad_s=0.0))
-    t = r["time_s"]
-    lagged = np.interp(t - 0.005, t, r["truth_motor1_velocity_rad_s"])
-    behind = np.std((r["motor1_velocity_rad_s"] - lagged)[50:])
-    assert behind < 0.2 * np.std((r["motor1_velocity_rad_s"] - r["truth_motor1_velocity_rad_s"])[50:])
+    read, truth = r["motor1_velocity_rad_s"], r["truth_motor1_velocity_rad_s"]
+    lagged = np.interp(r["time_s"] - 0.005, r["time_s"], truth)
+    assert np.std((read - lagged)[50:]) < 0.2 * np.std((read - truth)[50:])
 
 
 def test_current_is_noisy_and_comes_in_per_mille_of_the_rated_current():
@@ -67,10 +63,8 @@ def test_current_is_noisy_and_comes_in_per_mille_of_the_rated_current():
 
 
 def test_directions_turn_what_is_reported_and_not_what_happens():
-    plain, turned = (
-        recorded(DRIVE),
-        recorded(replace(DRIVE, direction=-1), replace(PERFECT_ENCODER, direction=-1)),
-    )
+    plain = recorded(DRIVE)
+    turned = recorded(replace(DRIVE, direction=-1), replace(PERFECT_ENCODER, direction=-1))
     for name in ("truth_link_position_rad", "truth_motor1_torque_nm"):
         assert turned[name] == pytest.approx(plain[name])
     world = World(sea(), (replace(DRIVE, direction=-1),), LinkEncoder(direction=-1), initial_rad=(0.1, 0.2))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ def world(seed: int = 0, **kwargs: object) -> World:
     return World(sea(), (NOISY,), excitation=build(EXCITATION, 1), seed=seed, **kwargs)
 
 
-def test_row_k_holds_what_is_sampled_at_t_k_and_the_torque_that_acts_from_there() -> None:
+def test_row_k_holds_what_is_sampled_at_t_k_and_the_torque_that_acts_from_there():
     """B w_{k+1} - B w_k = (tau_k + tau_e - D w) T: the torque of row k, neither the one before nor the next."""
     plant = sea(HARDENING)
     r = measured(plant)
@@ -36,7 +35,7 @@ def test_row_k_holds_what_is_sampled_at_t_k_and_the_torque_that_acts_from_there(
     assert r["time_s"] == pytest.approx(0.001 * np.arange(len(tau)))
 
 
-def test_a_set_point_acts_from_the_next_period_on_and_none_gives_the_motor_back_to_the_rig() -> None:
+def test_a_set_point_acts_from_the_next_period_on_and_none_gives_the_motor_back_to_the_rig():
     w = World(sea(), (PERFECT,), PERFECT_ENCODER)
     w.command(0, 0.1)
     assert w.drive(0).torque_nm == 0.0
@@ -52,7 +51,7 @@ def test_a_set_point_acts_from_the_next_period_on_and_none_gives_the_motor_back_
         assert (w.truth().motors[0].torque_nm != 0.0) == acts
 
 
-def test_many_periods_at_once_are_the_same_as_one_by_one() -> None:
+def test_many_periods_at_once_are_the_same_as_one_by_one():
     once, singly = world(), world()
     once.advance(500)
     for _ in range(500):
@@ -65,7 +64,7 @@ def test_many_periods_at_once_are_the_same_as_one_by_one() -> None:
 
 
 @pytest.mark.parametrize("effect", ["coulomb_friction=0.5", "hysteresis=1", "encoder_delay=0.0023"])
-def test_a_world_follows_from_its_seed(effect: str) -> None:
+def test_a_world_follows_from_its_seed(effect):
     first, again, other = (record(world(seed, effects=[parse(effect)]), 0.5) for seed in (3, 3, 4))
     for name, column in first.items():
         assert np.array_equal(column, again[name], equal_nan=True)
@@ -73,8 +72,8 @@ def test_a_world_follows_from_its_seed(effect: str) -> None:
     assert np.array_equal(first["truth_motor1_torque_nm"], other["truth_motor1_torque_nm"])
 
 
-def test_the_second_motor_of_a_serial_joint_sets_the_stiffness() -> None:
-    plant = sea(LINEAR, motors=2, gravity=0.0, lever=0.5)
+def test_the_second_motor_of_a_serial_joint_sets_the_stiffness():
+    plant = with_parameters(sea(LINEAR, motors=2, gravity=0.0, lever=0.8), {"lever_per_rad": 0.5})
     w = World(plant, (PERFECT, PERFECT), PERFECT_ENCODER, initial_rad=(0.1, 0.05, 0.4))
     truth = w.truth()
     assert truth.stiffness_nm_rad == pytest.approx(150.0 * 1.2**2)
@@ -83,13 +82,7 @@ def test_the_second_motor_of_a_serial_joint_sets_the_stiffness() -> None:
     assert truth.motors[1].flexibility_torque_nm == pytest.approx(-2 * 0.5 * 1.2 * 75.0 * 0.05**2)
 
 
-def test_the_lever_of_a_serial_joint_is_a_parameter() -> None:
-    assert with_parameters(sea(motors=2, lever=0.5), {"lever_per_rad": 0.8}).lever_per_rad == 0.8
-    with pytest.raises(SimError, match="lever_per_rad: unknown"):
-        with_parameters(sea(motors=2), {"lever_per_rad": 0.8})
-
-
-def test_a_rigid_joint_reports_no_stiffness() -> None:
+def test_a_rigid_joint_reports_no_stiffness():
     w = World(sea(RIGID), (PERFECT,), PERFECT_ENCODER)
     w.command(0, 0.1)
     w.advance(100)
@@ -98,7 +91,7 @@ def test_a_rigid_joint_reports_no_stiffness() -> None:
     assert truth.link_position_rad == truth.motors[0].position_rad > 0.0
 
 
-def test_a_recording_has_the_contracts_columns_and_the_truth() -> None:
+def test_a_recording_has_the_contracts_columns_and_the_truth():
     r = record(case("vsa-ii").world(), 0.25)
     assert {len(column) for column in r.values()} == {250}
     for name in ("time_s", "link_position_rad", "external_torque_nm", "truth_stiffness_nm_rad"):
@@ -113,6 +106,7 @@ def test_a_recording_has_the_contracts_columns_and_the_truth() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: with_parameters(sea(motors=2), {"lever_per_rad": 0.8}), "lever_per_rad: unknown"),
         (lambda: world(plant_step_s=0.0007), "plant_step_s: expected a whole fraction of the period 0.001 s"),
         (lambda: world(period_s=0.0), "period_s: expected a number > 0"),
         (lambda: world(initial_rad=(0.1,)), "initial_rad: expected 2 finite numbers"),
@@ -122,13 +116,13 @@ def test_a_recording_has_the_contracts_columns_and_the_truth() -> None:
         (lambda: World(sea(RIGID), (PERFECT,), initial_rad=(0.1, 0.2)), "expected q = theta at a rigid transmission"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused_in_one_line(make: Callable[[], object], message: str) -> None:
+def test_what_cannot_be_is_refused_in_one_line(make, message):
     with pytest.raises(SimError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
 
 
-def test_physics_can_change_on_the_way() -> None:
+def test_physics_can_change_on_the_way():
     w, unchanged = world(), world()
     for each in (w, unchanged):
         each.advance(1000)

@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 
-from drivelink.demo.simulate import (
-    assumptions,
-    bench_from_joints,
-    nodes_from_joint,
-    world_from_joint,
-)
+from drivelink.demo.simulate import assumptions, bench_from_joints, nodes_from_joint, world_from_joint
 from drivelink.errors import JointFileError, UsageError
 from drivelink.jointfile import JointFile, parse
 from sim.canopen.drive import Cia402Drive
@@ -62,7 +56,7 @@ def joint(text: str = SINGLE, extra: str = "") -> JointFile:
     return parse(text + extra)
 
 
-def test_without_a_case_the_model_is_the_truth() -> None:
+def test_without_a_case_the_model_is_the_truth():
     world = world_from_joint(joint())
     world.advance(500)
     truth = world.truth()
@@ -72,25 +66,23 @@ def test_without_a_case_the_model_is_the_truth() -> None:
     assert truth.stiffness_nm_rad == pytest.approx(150.0 + 1200.0 * phi**2)
 
 
-def test_the_rig_moves_any_joint_enough_and_not_too_far() -> None:
-    for stiffness in (0.1, 10.0, 150.0, 8000.0):
-        text = SINGLE.replace("[150.0, 400.0]", f"[{stiffness}]")
-        scale = stiffness / 150.0
-        text = text.replace("0.125", str(0.125 * scale)).replace("0.4\n", f"{0.4 * scale}\n")
-        text = text.replace("0.8", str(0.8 * scale))
-        world = world_from_joint(joint(text))
-        deflections, positions = [], []
-        for _ in range(1000):
-            world.advance(10)
-            truth = world.truth()
-            deflections.append(abs(truth.motors[0].deflection_rad))
-            positions.append(abs(truth.link_position_rad))
-        # Enough: a hundred counts of a 16-bit encoder. Not too far: within half a turn.
-        assert max(deflections) > 100 * 2 * math.pi / 65536, stiffness
-        assert max(positions) < math.pi, stiffness
+@pytest.mark.parametrize("stiffness", [0.1, 150.0, 8000.0])
+def test_the_rig_moves_any_joint_enough_and_not_too_far(stiffness):
+    scale, text = stiffness / 150.0, SINGLE.replace("[150.0, 400.0]", f"[{stiffness}]")
+    for number in ("0.125", "0.8", "0.4\n"):
+        text = text.replace(number, f"{float(number) * scale}\n")
+    world = world_from_joint(joint(text))
+    deflections, positions = [], []
+    for _ in range(1000):
+        world.advance(10)
+        truth = world.truth()
+        deflections.append(abs(truth.motors[0].deflection_rad))
+        positions.append(abs(truth.link_position_rad))
+    # Enough: a hundred counts of a 16-bit encoder. Not too far: within half a turn.
+    assert max(deflections) > 100 * 2 * math.pi / 65536 and max(positions) < math.pi
 
 
-def test_true_values_may_differ_from_the_models() -> None:
+def test_true_values_may_differ_from_the_models():
     extra = """
 [sim]
 parameters = { motor1_inertia_kg_m2 = 0.2, motor1_coefficient2_nm_rad = 500.0, link_gravity_nm = 6.0 }
@@ -113,14 +105,14 @@ parameters = { motor1_inertia_kg_m2 = 0.2, motor1_coefficient2_nm_rad = 500.0, l
         ("[sim]\ncase = 'vsa-ii'", 'elbow: sim: case "vsa-ii" is antagonistic, this joint is single'),
     ],
 )
-def test_what_cannot_be_simulated_is_one_line(extra: str, message: str) -> None:
+def test_what_cannot_be_simulated_is_one_line(extra, message):
     with pytest.raises(JointFileError) as caught:
         world_from_joint(joint(extra=extra))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_model_without_parameters_gets_a_spring_and_that_is_said() -> None:
+def test_a_model_without_parameters_gets_a_spring_and_that_is_said():
     text = SINGLE.replace("parameters = { coefficients_nm_rad = [150.0, 400.0] }", "")
     made = joint(text)
     spring = world_from_joint(made).plant.motors[0].spring.law()
@@ -131,7 +123,7 @@ def test_a_model_without_parameters_gets_a_spring_and_that_is_said() -> None:
     assert not any("N·m/rad" in line for line in assumptions(joint()))
 
 
-def test_effects_come_from_the_file_the_model_and_the_command_line() -> None:
+def test_effects_come_from_the_file_the_model_and_the_command_line():
     extra = "[sim]\n[[sim.effect]]\nname = 'torque_offset'\nparameters = { torque_nm = 0.1 }"
     plain = world_from_joint(joint())
     offset = world_from_joint(joint(extra=extra))
@@ -143,43 +135,36 @@ def test_effects_come_from_the_file_the_model_and_the_command_line() -> None:
         world_from_joint(joint(), effects=["magic=1"])
 
 
-def test_the_devices_report_what_the_joint_file_says() -> None:
-    drive, encoder = nodes_from_joint(joint(), world_from_joint(joint()))
-    assert isinstance(drive, Cia402Drive)
-    assert isinstance(encoder, Cia406Encoder)
+def test_the_devices_report_what_the_joint_file_says():
+    """Positions on the bus are the joint's through gear, direction and offset."""
+    world = world_from_joint(joint())
+    drive, encoder = nodes_from_joint(joint(), world)
+    assert isinstance(drive, Cia402Drive) and isinstance(encoder, Cia406Encoder)
     assert (drive.node_id, encoder.node_id) == (3, 9)
     assert drive.dictionary.find(0x608F, 1).value == 4096
     assert [drive.dictionary.find(0x6091, k).value for k in (1, 2)] == [100, 1]
     assert encoder.dictionary.find(0x6501, 0).value == 65536
-
-
-def test_positions_on_the_bus_are_the_joints_through_gear_direction_and_offset() -> None:
-    file = joint()
-    world = world_from_joint(file)
-    drive, encoder = nodes_from_joint(file, world)
     world.advance(300)
     truth = world.truth()
-    counts = int.from_bytes(drive.dictionary.find(0x6064, 0).upload(), "little", signed=True)
+    counts, link = (
+        int.from_bytes(node.dictionary.find(index, 0).upload(), "little", signed=True)
+        for node, index in ((drive, 0x6064), (encoder, 0x6004))
+    )
     # Half a count of each encoder, at the joint.
     assert -counts * 2 * math.pi / 409600 == pytest.approx(truth.motors[0].position_rad, abs=8e-6)
-    link = int.from_bytes(encoder.dictionary.find(0x6004, 0).upload(), "little", signed=True)
     assert link * 2 * math.pi / 65536 - 0.25 == pytest.approx(truth.link_position_rad, abs=5e-5)
 
 
-def test_the_link_encoder_is_wired_to_the_drive_that_the_file_names() -> None:
-    first, second = nodes_from_joint(joint(VSA), world_from_joint(joint(VSA)))
-    assert first.dictionary.find(0x60E6, 1).value == 0
-    assert second.dictionary.find(0x60E6, 1).value == 262144
-
-
-def test_a_case_brings_its_drives_and_the_file_overrides_them() -> None:
+def test_a_case_brings_its_drives_and_the_file_overrides_them():
     world = world_from_joint(joint(VSA))
     assert world.drives[0].gear_ratio == 20.0
+    wired = [node.dictionary.find(0x60E6, 1).value for node in nodes_from_joint(joint(VSA), world)]
+    assert wired == [0, 262144]  # the link encoder, to the drive that the file names
     text = VSA.replace("node_id = 1\n", "node_id = 1\ngear_ratio = 50.0\n")
     assert world_from_joint(joint(text)).drives[0].gear_ratio == 50.0
 
 
-def test_quirks_come_from_the_file_or_the_command_line() -> None:
+def test_quirks_come_from_the_file_or_the_command_line():
     file = joint(VSA + 'quirks = "epos4"\n')
     world = world_from_joint(file)
     assert nodes_from_joint(file, world)[0].quirks.name == "epos4"
@@ -190,15 +175,11 @@ def test_quirks_come_from_the_file_or_the_command_line() -> None:
         nodes_from_joint(joint(VSA + 'quirks = "acme"\n'), world)
 
 
-def test_two_joints_share_a_bus_and_their_data_sheets_are_written(tmp_path: Path) -> None:
+def test_two_joints_share_a_bus_and_their_data_sheets_are_written(tmp_path):
     bench = bench_from_joints([joint(), joint(VSA)])
     assert bench.describe() == "elbow (drive 3, encoder 9); wrist (drive 1, drive 2)"
     bench.write_eds(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "elbow-node3.eds",
-        "elbow-node9.eds",
-        "wrist-node1.eds",
-        "wrist-node2.eds",
-    }
+    nodes = ("elbow-node3", "elbow-node9", "wrist-node1", "wrist-node2")
+    assert {path.name for path in tmp_path.iterdir()} == {f"{node}.eds" for node in nodes}
     with pytest.raises(UsageError, match="got 1 twice"):
         bench_from_joints([joint(VSA), joint(VSA)])

@@ -22,12 +22,13 @@ pytestmark = pytest.mark.skipif(NODE is None, reason="needs node")
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "drivelink" / "monitor" / "page.html"
 STATUS = {
-    "state": "running",
-    "rate_hz": 1000.0,
-    "nodes": {"1": {"state": "operational", "fault": False}},
-    "residual_alarm": {"active": False, "residual_nm": [0.01], "floor_nm": [0.02]},
-    "transmissions": [{}],
-}
+    "state": "running", "rate_hz": 1000.0, "nodes": {"1": {"state": "operational", "fault": False}},
+    "residual_alarm": {"active": False, "residual_nm": [0.01], "floor_nm": [0.02]}, "transmissions": [{}],
+}  # fmt: skip
+SPAN = """
+    take(sent[0]);
+    const { X, Y, T, B } = $("torqueplot").shown;
+"""
 
 
 def fed(seconds: float = 4.0, wild: float | None = None) -> JointView:
@@ -45,34 +46,38 @@ def fed(seconds: float = 4.0, wild: float | None = None) -> JointView:
 
 def page(scenario: str, *views: JointView) -> Any:
     """What a scenario returns; `sent[i]` is what the server sends of each view."""
-    script = re.search(r"<script>(.*)</script>", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert script is not None
+    script = re.search(r"<script>(.*)</script>", PAGE.read_text(encoding="utf-8"), re.DOTALL)[1]
     sent = json.dumps([{"joints": {view.name: snapshot(view, True, {})}} for view in views])
-    program = (
-        (HERE / "page.js").read_text(encoding="utf-8")
-        + script[1]
-        + f"const sent = {sent};\nconsole.log(JSON.stringify((() => {{ {scenario} }})()));\n"
-    )
-    assert NODE is not None
+    program = (HERE / "page.js").read_text(encoding="utf-8") + script
+    program += f"const sent = {sent};\nconsole.log(JSON.stringify((() => {{ {scenario} }})()));\n"
     done = subprocess.run([NODE, "-"], input=program, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
 
-def test_the_page_shows_numbers_flags_gauge_and_nodes() -> None:
-    texts = page(
-        "take(sent[0]); return ['stiffness', 'band', 'state', 'flags', 'gauges', 'nodes'].map(shown);", fed()
+def test_the_page_shows_numbers_flags_gauge_and_nodes_and_that_the_monitor_has_ended():
+    texts, ended = page(
+        """
+        const look = names => names.map(shown);
+        take(sent[0]);
+        const texts = look(['stiffness', 'band', 'state', 'flags', 'gauges', 'nodes']);
+        events.onerror();
+        return [texts, look(['state', 'flags', 'link'])];
+        """,
+        fed(),
     )
     assert texts[:4] == ["100.0", "± 2.0", "running · rate 1000 Hz", "valid observable"]
     assert "0.50 × baseline" in texts[4] and "node 1 operational" in texts[5]
+    state, flags, link = ended
+    assert state == "no connection: these are the last numbers"
+    assert flags == "no connection" and link.startswith("drivelink monitor has ended")
 
 
-def test_the_pointer_reads_the_curve_at_its_place() -> None:
-    text, moment, left = page(
-        """
-        take(sent[0]);
+def test_the_pointer_reads_the_curve_at_its_place():
+    text, moment, hidden = page(
+        SPAN
+        + """
         const m = joints.elbow.moments.at(-50), now = joints.elbow.moments.at(-1)[0];
-        const { X, Y } = $("torqueplot").shown;
         hover("torqueplot", X(m[0] - now), Y(m[1]));
         const text = $("tip").textContent;
         $("torqueplot").onmouseleave();
@@ -80,14 +85,12 @@ def test_the_pointer_reads_the_curve_at_its_place() -> None:
         """,
         fed(),
     )
-    assert text == f"time {moment[0]} s\n{moment[1]} N·m"
-    assert left is True  # hidden again
+    assert text == f"time {moment[0]} s\n{moment[1]} N·m" and hidden is True
 
 
 @pytest.mark.parametrize("how", ["press(' ');", "$('pause').onclick();"])
-def test_a_pause_holds_numbers_and_curves_and_what_came_is_there_afterwards(how: str) -> None:
-    first, second = fed(4.0), fed(5.5)
-    states = page(
+def test_a_pause_holds_numbers_and_curves_and_what_came_is_there_afterwards(how):
+    before, held, after = page(
         f"""
         const look = () => [shown("torque"), $("torqueplot").shown.series[0].length, shown("link"), shown("pause")];
         take(sent[0]);
@@ -99,64 +102,46 @@ def test_a_pause_holds_numbers_and_curves_and_what_came_is_there_afterwards(how:
         {how}
         return [before, held, look()];
         """,
-        first,
-        second,
+        fed(4.0),
+        fed(5.5),
     )
-    before, held, after = states
     assert held[:2] == before[:2] and held[2:] == ["paused", "go on"]
     assert after[0] != before[0] and after[1] > before[1] and after[2:] == ["connected", "pause"]
 
 
 @pytest.mark.parametrize("wild", [1e6, -1e6])
-def test_one_wild_value_does_not_flatten_an_axis(wild: float) -> None:
-    low, high, height = page(
-        """
-        take(sent[0]);
-        const { Y, T, B } = $("torqueplot").shown;
-        return [Y(-2), Y(2), B - T];
-        """,
-        fed(4.0, wild),
-    )
+def test_one_wild_value_does_not_flatten_an_axis(wild):
+    low, high, height = page(SPAN + "return [Y(-2), Y(2), B - T];", fed(4.0, wild))
     assert low - high > 0.5 * height  # the sine fills more than half of the plot
 
 
-def test_the_axis_of_the_external_torque_fits_its_band() -> None:
+def test_the_axis_of_the_external_torque_fits_its_band():
     view = fed()
     for k in range(4000):
         torque_nm = 1e-3 * math.sin(2e-3 * k)
         view.update_external(ExternalMessage(k, k * 1_000_000, 1, torque_nm, 0.01), 1e-3 * k)
-    low, high, height = page(
-        """
-        take(sent[0]);
-        const { Y, T, B } = $("externalplot").shown;
-        return [Y(-0.0196), Y(0.0196), B - T];
-        """,
-        view,
-    )
+    span = SPAN.replace("torqueplot", "externalplot")
+    low, high, height = page(span + "return [Y(-0.0196), Y(0.0196), B - T];", view)
     assert 0.7 * height < low - high < height
 
 
-def test_what_is_not_valid_is_shown_grey_with_the_reason_and_sets_no_scale() -> None:
-    view = fed()
+def test_what_is_not_valid_is_shown_grey_with_the_reason_and_sets_no_scale():
+    view, one = fed(), (TransmissionEstimate(500.0, 900.0, 1.0, 0.01),)
     for k in range(4000, 6000):
-        one = TransmissionEstimate(500.0, 900.0, 1.0, 0.01)
-        view.update(Estimate(k, int(Status.OBSERVABLE), 500.0, 900.0, 1.0, (one,)), 1e-3 * k)
+        view.update(Estimate(k, int(Status.OBSERVABLE), 500.0, 900.0, 1.0, one), 1e-3 * k)
     low, high, height, tip, title, style = page(
-        """
-        take(sent[0]);
-        const { X, Y, T, B } = $("torqueplot").shown;
+        SPAN
+        + """
         hover("torqueplot", X(-1), Y(500));
         return [Y(-2), Y(2), B - T, $("tip").textContent, document.title, $("stiffness").className];
         """,
         view,
     )
-    assert low - high > 0.5 * height
-    assert (
-        tip.endswith("500.0 N·m\nnot valid") and title == "not valid · elbow · drivelink" and style == "past"
-    )
+    assert low - high > 0.5 * height and tip.endswith("500.0 N·m\nnot valid")
+    assert (title, style) == ("not valid · elbow · drivelink", "past")
 
 
-def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers() -> None:
+def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers():
     gone = fed()
     gone.gone, gone.silent_s = True, 12.0
     state, style, flags, number_style, gauges, rows = page(
@@ -173,11 +158,3 @@ def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers() -> None:
     assert state == "daemon gone, last estimate 12 s ago" and style == "red"
     assert flags == ["flag red"] and number_style == "past"
     assert gauges and rows == 0
-
-
-def test_a_monitor_that_has_ended_is_shown_too() -> None:
-    state, flags, link = page(
-        "take(sent[0]); events.onerror(); return ['state', 'flags', 'link'].map(shown);", fed()
-    )
-    assert state == "no connection: these are the last numbers"
-    assert flags == "no connection" and link.startswith("drivelink monitor has ended")

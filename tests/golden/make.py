@@ -19,28 +19,13 @@ MAX_U64 = 2**64 - 1
 ESTIMATES = {
     "rigid": (0, 0, 0, 0.0, 0.0, 0.0, []),
     "single": (1, 1_700_000_000_000_000_000, 3, 12.5, 812.25, 4.0, [(12.5, 812.25, 4.0, 0.0153)]),
-    "antagonistic": (
-        123_456,
-        1_795_000_000_123_456_789,
-        3,
-        -0.75,
-        61.0,
-        1.5,
-        [(9.25, 30.5, 1.0, 0.3), (-10.0, 30.5, 1.125, -0.328125)],
-    ),
+    "antagonistic": (123_456, 1_795_000_000_123_456_789, 3, -0.75, 61.0, 1.5,
+                     [(9.25, 30.5, 1.0, 0.3), (-10.0, 30.5, 1.125, -0.328125)]),
     "held": (2, 2_000_000, 0x00000404, 1e-300, 5e-324, math.inf, [(1e-300, 5e-324, math.inf, -0.0)]),
     "torque_only": (4, 4_000_000, 0x2001, 2.5, math.nan, math.nan, [(2.5, math.nan, math.nan, math.nan)]),
     "invalid": (3, 3_000_000, 0, math.nan, math.nan, math.nan, [(math.nan, math.nan, math.nan, 0.125)]),
-    "extremes": (
-        MAX_U64,
-        MAX_U64,
-        2**32 - 1,
-        -1.7976931348623157e308,
-        0.1,
-        1 / 3,
-        [(0.1, 0.2, 0.3, 0.4)] * 3,
-    ),
-}
+    "extremes": (MAX_U64, MAX_U64, 2**32 - 1, -1.7976931348623157e308, 0.1, 1 / 3, [(0.1, 0.2, 0.3, 0.4)] * 3),
+}  # fmt: skip
 # What a client must not take: bytes that are no estimate, and numbers that cannot be called valid.
 _WHOLE = (1, 2, 3, 12.5, 812.25, 4.0, [(12.5, 812.25, 4.0, 0.0153)])
 _HEAD = bytes(44)
@@ -77,8 +62,6 @@ SAMPLES = {
     ),
     "rigid": (3, 5, math.nan, math.nan, math.nan, [(1.0, 2.0, 3.0)]),
 }
-
-
 EXTERNALS = {
     "push": (123_456, 1_795_000_000_123_456_789, 3, -0.75, 0.015625),
     "free": (1, 1_700_000_000_000_000_000, 1, 0.1, 1 / 3),
@@ -102,31 +85,25 @@ WRONG_EXTERNALS = {
 }
 
 
-def external(sequence, stamp_ns, status, torque, std):
-    return z_serialize((UInt64(sequence), UInt64(stamp_ns), UInt32(status), Float64(torque), Float64(std)))
+KINDS = {  # of the numbers of a message before its list
+    "estimate": (UInt64, UInt64, UInt32, *[Float64] * 3),
+    "sample": (UInt64, UInt64, *[Float64] * 3),
+    "external": (UInt64, UInt64, UInt32, *[Float64] * 2),
+}
 
 
-def estimate(sequence, stamp_ns, status, torque, stiffness, std, transmissions):
-    head = (
-        UInt64(sequence),
-        UInt64(stamp_ns),
-        UInt32(status),
-        Float64(torque),
-        Float64(stiffness),
-        Float64(std),
+def serialized(kind, values):
+    """The bytes of a message; what follows the numbers is a list of tuples."""
+    head = tuple(make(value) for make, value in zip(KINDS[kind], values, strict=False))
+    return bytes(
+        z_serialize((*head, *([tuple(map(Float64, one)) for one in rest] for rest in values[len(head) :])))
     )
-    return z_serialize((*head, [tuple(map(Float64, numbers)) for numbers in transmissions]))
 
 
-def sample(sequence, stamp_ns, link, velocity, external, motors):
-    head = (UInt64(sequence), UInt64(stamp_ns), Float64(link), Float64(velocity), Float64(external))
-    return z_serialize((*head, [tuple(map(Float64, numbers)) for numbers in motors]))
-
-
-def line(name, payload, values):
-    *head, elements = values
-    numbers = [*head, len(elements), *(number for element in elements for number in element)]
-    return " ".join([name, bytes(payload).hex(), *map(repr, numbers)]) + "\n"
+def line(name, kind, values):
+    head, lists = values[: len(KINDS[kind])], values[len(KINDS[kind]) :]
+    numbers = [*head, *(number for one in lists for number in (len(one), *(x for each in one for x in each)))]
+    return " ".join([name, serialized(kind, values).hex(), *map(repr, numbers)]) + "\n"
 
 
 def refused():
@@ -139,28 +116,21 @@ def refused():
                 values[place] = number
             else:
                 values[place] = [tuple(number if i == inner else v for i, v in enumerate(_WHOLE[place][0]))]
-            yield f"valid_with_{what}_of_{number:g}", bytes(estimate(*values))
+            yield f"valid_with_{what}_of_{number:g}", serialized("estimate", values)
     partial = (4, 4, 0x2001, 2.5, math.inf, math.nan, [])
-    yield "valid_and_partial_with_stiffness_of_inf", bytes(estimate(*partial))
+    yield "valid_and_partial_with_stiffness_of_inf", serialized("estimate", partial)
 
 
 def main():
-    for file, serialize, vectors in (("estimate.txt", estimate, ESTIMATES), ("sample.txt", sample, SAMPLES)):
-        text = "".join(line(name, serialize(*values), values) for name, values in vectors.items())
-        (HERE / file).write_text(text, encoding="ascii")
-    text = "".join(
-        " ".join([name, bytes(external(*values)).hex(), *map(repr, values)]) + "\n"
-        for name, values in EXTERNALS.items()
-    )
-    (HERE / "external.txt").write_text(text, encoding="ascii")
-    wrong = {name: bytes(external(*values)) for name, values in WRONG_EXTERNALS.items()}
-    for file, vectors in (
-        ("refused.txt", dict(refused())),
-        ("refused_external.txt", REFUSED_EXTERNALS | wrong),
-    ):
+    """Write the files."""
+    for kind, vectors in (("estimate", ESTIMATES), ("sample", SAMPLES), ("external", EXTERNALS)):
+        text = "".join(line(name, kind, values) for name, values in vectors.items())
+        (HERE / f"{kind}.txt").write_text(text, encoding="ascii")
+    wrong = {name: serialized("external", values) for name, values in WRONG_EXTERNALS.items()}
+    for file, vectors in (("refused", dict(refused())), ("refused_external", REFUSED_EXTERNALS | wrong)):
         # "-" stands for no bytes
         text = "".join(f"{name} {payload.hex() or '-'}\n" for name, payload in vectors.items())
-        (HERE / file).write_text(text, encoding="ascii")
+        (HERE / f"{file}.txt").write_text(text, encoding="ascii")
 
 
 if __name__ == "__main__":

@@ -51,16 +51,12 @@ class FuzzBus:
             FuzzNode(3, encoder_objects(3), starts_itself=True),
         ]
         self.loop: CycleLoop | None = None
-        self.lost_sends = 0
         self.errors: dict[str, int] = {}
-        self.tick = 0
-        self.frames = 0
-        self.rate = 0.0
-        self.mix: Mix = MIXES[0]
+        self.lost_sends = self.tick = self.frames = self._stamp_ns = 0
+        self.rate, self.mix = 0.0, MIXES[0]
         self.kinds: Counter[str] = Counter()
         self.forged: deque[set[tuple[int, int]]] = deque([set(), set()], maxlen=2)  # (identifier, length)
         self._hostile = hostile
-        self._stamp_ns = 0
         self._random = generator
         self._queue: deque[tuple[int, bytes]] = deque()
         self._late: list[tuple[int, bytes]] = []
@@ -89,8 +85,6 @@ class FuzzBus:
         pass
 
     def take(self) -> list[CanFrame]:
-        if not self._queue:
-            return []
         taken = [CanFrame(cob_id, data, self._stamp_ns) for cob_id, data in self._queue]
         self._queue.clear()
         self.frames += len(taken)
@@ -132,9 +126,7 @@ class FuzzBus:
         self._sync(frames)
         if self.rate and draw.random() < 0.7:
             frames = self._disturbed(frames, late)
-        queue = self._queue
-        for frame in frames:
-            queue.append(frame)
+        self._queue.extend(frames)
         self._recent.extend(frames[:2])
 
     def _sync(self, frames: list[tuple[int, bytes]]) -> None:
@@ -217,14 +209,12 @@ class FuzzBus:
     def _sdo(self) -> bytes:
         draw = self._random
         command = draw.choice((0x40, 0x43, 0x4B, 0x4F, 0x60, 0x80, 0x00, 0x10, 0x20, 0x41, 0xC0))
+        indices, lengths = (0x1000, 0x1018, 0x1800, 0x1A00, 0x6064, 0x608F, 0x6076, 0x60A9, 0x6004), (8,)
         if not self._hostile:
             # An object that the configuration never asks for: a forged answer that fits cannot be detected.
-            index = draw.choice((0x2000, 0x6502, 0x1003))
-            return (bytes([command]) + struct.pack("<HB", index, draw.randrange(4)) + draw.randbytes(4))[
-                : draw.choice((8, 8, 8, 7, 3))
-            ]
-        index = draw.choice((0x1000, 0x1018, 0x1800, 0x1A00, 0x6064, 0x608F, 0x6076, 0x60A9, 0x6004))
-        return bytes([command]) + struct.pack("<HB", index, draw.randrange(4)) + draw.randbytes(4)
+            indices, lengths = (0x2000, 0x6502, 0x1003), (8, 8, 8, 7, 3)
+        data = struct.pack("<BHB", command, draw.choice(indices), draw.randrange(4)) + draw.randbytes(4)
+        return data[: draw.choice(lengths)]
 
     def _rare(self) -> tuple[int, bytes]:
         """What changes the state of a node, or of the bus."""

@@ -13,16 +13,10 @@ NO_RTR = 1 << 30
 
 def encoder_objects(node: int) -> Objects:
     objects: Objects = {
-        (0x1000, 0): u32(0x00020196),
-        (0x1005, 0): u32(0x80, True),
-        (0x1017, 0): Item(0, 2, True),
-        (0x1018, 1): u32(0x4321),
-        (0x6001, 0): u32(65536),
-        (0x6002, 0): u32(1 << 24),
-        (0x6004, 0): u32(0, mappable=True),
-        (0x6501, 0): u32(65536),
-        (0x6502, 0): Item(256, 2),
-    }
+        (0x1000, 0): u32(0x00020196), (0x1005, 0): u32(0x80, True), (0x1017, 0): Item(0, 2, True),
+        (0x1018, 1): u32(0x4321), (0x6001, 0): u32(65536), (0x6002, 0): u32(1 << 24),
+        (0x6004, 0): u32(0, mappable=True), (0x6501, 0): u32(65536), (0x6502, 0): Item(256, 2),
+    }  # fmt: skip
     return objects | tpdo(1, NO_RTR | 0x180 + node, 254, 0x60040020)
 
 
@@ -54,14 +48,9 @@ class FuzzNode:
 
     def values(self, tick: int) -> dict[int, int]:
         """What it measures at a SYNC: every value identifies the tick, the position alone uniquely."""
-        return {
-            0x6064: 3 * tick + 1000 * self.node,
-            0x606C: 0x7000_0000 - tick,
-            0x6077: tick % 30000,
-            0x6078: tick % 30000,
-            0x6041: 0x0250,
-            0x6004: 5 * tick + 7,
-        }
+        current = tick % 30000
+        moved = {0x6064: 3 * tick + 1000 * self.node, 0x606C: 0x7000_0000 - tick, 0x6004: 5 * tick + 7}
+        return {**moved, 0x6077: current, 0x6078: current, 0x6041: 0x0250}
 
     def handle(self, cob_id: int, data: bytes) -> list[tuple[int, bytes]]:
         if cob_id == 0:

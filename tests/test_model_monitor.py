@@ -1,7 +1,5 @@
 """The model's monitor: silent while the model is sufficient, an alarm with the right place when it is not."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -13,7 +11,7 @@ from estimator import transmissions
 from estimator.identify import identify
 from estimator.model import JointModel
 from estimator.model_monitor import ModelMonitor, ResidualBaseline, can_monitor, measure_baseline
-from estimator.sample import Estimate, Record, Sample
+from estimator.sample import Estimate, Sample
 
 NOTHING = Estimate(0, 0, 0.0, 0.0, 0.0, ())
 PLACES = {"coulomb_nm": "motor", "hysteresis_nm": "transmission", "gravity_nm": "link"}
@@ -39,7 +37,7 @@ def monitor(fitted):
     return ModelMonitor(fitted[0], kit.PERIOD_S, fitted[1])
 
 
-def _play(monitor: ModelMonitor, record: Record, first: int = 0, external_nm: float = math.nan) -> list[bool]:
+def _play(monitor, record, first=0, external_nm=math.nan):
     assert record.link_position_rad is not None
     alarms = []
     for k in range(len(record)):

@@ -1,7 +1,5 @@
 """The live views: what fits where, what is distinguished, and the page in a real browser."""
 
-from __future__ import annotations
-
 import fcntl
 import io
 import json
@@ -17,7 +15,6 @@ import termios
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 from typing import NamedTuple
 
 import chromium
@@ -55,13 +52,13 @@ class Truth(NamedTuple):
     stiffness_nm_rad: float
 
 
-def estimate(k: int, motors: int = 2, status: int = 3) -> Estimate:
+def estimate(k, motors=2, status=3):
     phis = [0.1 * math.sin((1.3 + 0.4 * i) * k * 1e-3) for i in range(motors)]
     ones = [TransmissionEstimate(100 * x + 1000 * x**3, 100 + 3000 * x * x, 2 + 20 * abs(x), x) for x in phis]
     return Estimate(k, status, sum(o[0] for o in ones), sum(o[1] for o in ones), 4.0, tuple(ones))
 
 
-def filled(motors: int = 2, truth: bool = False, n: int = 4000) -> JointView:
+def filled(motors=2, truth=False, n=4000):
     view = JointView("elbow", subtitle="vsa-ii on the virtual bus")
     for k in range(n):
         e = estimate(k, motors)
@@ -70,7 +67,7 @@ def filled(motors: int = 2, truth: bool = False, n: int = 4000) -> JointView:
     return view
 
 
-def lines(view: object, width: int = 80, height: int = 24) -> list[str]:
+def lines(view, width=80, height=24):
     console = Console(width=width, height=height, record=True, file=io.StringIO())
     console.print(view)
     return console.export_text().rstrip("\n").split("\n")
@@ -158,13 +155,6 @@ def test_the_page_gets_each_external_torque_once_and_a_gap_where_it_is_not_valid
     assert again["restart"] and [one[0] for one in again["touches"]] == [0.0]
 
 
-def test_several_joints_are_one_line_each():
-    other = filled(1)
-    other.gone = True
-    shown = lines(joints_table({"elbow": filled(), "wrist": other}, 80))
-    assert len(shown) == 3 and "daemon gone" in shown[2] and all(len(line) <= 80 for line in shown)
-
-
 def test_the_curve_grows_and_keeps_the_latest_value_of_each_place():
     curve = GrowingCurve()
     for scale in (1.0, 2.0):
@@ -240,7 +230,7 @@ def test_the_watcher_finds_joints_and_notes_when_they_are_gone():
     session = open_client(endpoint)
     watcher = Watcher(session)
 
-    def polled() -> JointView | None:
+    def polled():
         watcher.poll()
         return watcher.views.get("elbow")
 
@@ -252,7 +242,7 @@ def test_the_watcher_finds_joints_and_notes_when_they_are_gone():
     close_session(session)
 
 
-def printed(wanted: Callable[[str], bool], *arguments: str) -> str:
+def printed(wanted, *arguments):
     """The first line that `drivelink monitor` prints of which this is true."""
     command = [sys.executable, "-m", "drivelink", "monitor", "--every", "0.2", *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -263,9 +253,13 @@ def printed(wanted: Callable[[str], bool], *arguments: str) -> str:
             process.kill()
 
 
-def test_without_a_terminal_monitor_prints_plain_lines(daemon):
+def test_without_a_terminal_monitor_prints_plain_or_json_lines(daemon):
     line = printed(lambda line: "no estimate yet" not in line, "elbow", "--endpoint", daemon)
     assert "elbow: stiffness 700.0 ± 5.9 N·m/rad" in line and "\x1b" not in line
+    complete = lambda line: '"live": true' in line and '"estimate"' in line and '"running"' in line  # noqa: E731
+    displayed = json.loads(printed(complete, "--json", "--endpoint", daemon))
+    assert displayed["joint"] == "elbow" and displayed["status"]["state"] == displayed["state"] == "running"
+    assert displayed["estimate"]["stiffness"] == 700.0
 
 
 def test_in_a_terminal_question_mark_shows_the_legend_and_q_quits(daemon):
@@ -295,16 +289,6 @@ def test_in_a_terminal_question_mark_shows_the_legend_and_q_quits(daemon):
     os.close(master)
 
 
-def test_monitor_prints_json_lines(daemon):
-    def complete(line: str) -> bool:
-        displayed = json.loads(line)
-        return displayed["live"] and "estimate" in displayed and displayed["state"] == "running"
-
-    displayed = json.loads(printed(complete, "--json", "--endpoint", daemon))
-    assert displayed["joint"] == "elbow" and displayed["status"]["state"] == "running"
-    assert displayed["estimate"]["stiffness"] == 700.0
-
-
 def test_a_joint_that_nobody_serves_is_not_live_and_the_nearest_is_named(daemon, capsys, monkeypatch):
     monkeypatch.setattr("drivelink.monitor.watcher.PATIENCE_S", 0.3)
     assert cli.main(["monitor", "elbwo", "--endpoint", daemon, "--seconds", "2.2", "--json"]) == 0
@@ -313,7 +297,7 @@ def test_a_joint_that_nobody_serves_is_not_live_and_the_nearest_is_named(daemon,
     assert displayed["state"] == 'no daemon of "elbwo"; did you mean "elbow"? there is elbow'
 
 
-def get(url: str, host: str | None = None) -> tuple[int, bytes]:
+def get(url, host=None):
     request = urllib.request.Request(url, headers={"Host": host} if host else {})
     try:
         with urllib.request.urlopen(request, timeout=60) as response:
@@ -346,7 +330,7 @@ def test_the_page_loads_nothing_from_elsewhere_and_answers_this_machine_only(web
 def test_events_bring_new_moments_once(web):
     since: dict[str, float] = {}
 
-    def event() -> dict:
+    def event():
         web.poll()
         return json.loads(web.event(since))["joints"].get("elbow", {})
 
@@ -418,11 +402,11 @@ def test_a_port_that_is_taken_is_one_line(web, capsys):
     assert "cannot be served" in err and err.count("\n") == 1
 
 
-def connect(web: WebView) -> socket.socket:
+def connect(web):
     return socket.create_connection(("127.0.0.1", int(web.url.rsplit(":", 1)[1].strip("/"))), timeout=60)
 
 
-def test_the_page_serves_so_many_connections_at_a_time(web, monkeypatch):
+def test_the_page_serves_so_many_connections_at_a_time_and_leaves_those_that_say_nothing(web, monkeypatch):
     monkeypatch.setattr("drivelink.monitor.web._Handler.timeout", 60.0)
     idle = [connect(web) for _ in range(MAX_CONNECTIONS)]
     with connect(web) as refused:
@@ -430,9 +414,12 @@ def test_the_page_serves_so_many_connections_at_a_time(web, monkeypatch):
     for connection in idle:
         connection.close()
     zenohkit.until(lambda: get(web.url)[0] == 200)
+    monkeypatch.setattr("drivelink.monitor.web._Handler.timeout", 0.1)
+    with connect(web) as silent:
+        assert silent.recv(100) == b""
 
 
-def stream(web: WebView, **headers: str) -> socket.socket:
+def stream(web, **headers):
     """A connection that asks for the events; its headers are read."""
     connection = connect(web)
     host = web.url.split("/")[2]
@@ -464,12 +451,6 @@ def test_streams_that_stay_open_do_not_fill_the_page(web):
     assert get(web.url)[0] == 200
     for connection in held:
         connection.close()
-
-
-def test_the_page_leaves_a_connection_that_says_nothing(web, monkeypatch):
-    monkeypatch.setattr("drivelink.monitor.web._Handler.timeout", 0.1)
-    with connect(web) as idle:
-        assert idle.recv(100) == b""
 
 
 def test_a_daemon_that_is_silent_or_gone_leaves_no_green_and_no_live_numbers():
@@ -529,20 +510,21 @@ def test_the_residual_is_a_gauge_against_its_baseline_before_and_after():
 def test_every_view_says_what_to_do_on_a_model_alarm():
     view = filled()
     view.status = ALARM
-    displayed = snapshot(view, True, {})["status"]
     assert "do not control on it; drivelink diagnose says why" in "\n".join(lines(view, 80))
-    for text in (view.line(), "\n".join(lines(view, 240)), displayed["advice"]):
+    for text in (view.line(), "\n".join(lines(view, 240)), snapshot(view, True, {})["status"]["advice"]):
         assert "likely at the transmission" in text and "drivelink diagnose" in text
     view.status = STATUS
     assert "diagnose" not in view.line() and not snapshot(view, True, {})["status"]["alarm"]
 
 
-def test_no_column_of_the_table_is_cut_off():
-    far, wild = filled(), {"stiffness_nm_rad": -1.23456e7, "stiffness_std_nm_rad": 9.87e6}
+def test_several_joints_are_one_line_each_and_no_column_is_cut_off():
+    far, gone, wild = filled(), filled(1), {"stiffness_nm_rad": -1.23456e7, "stiffness_std_nm_rad": 9.87e6}
+    gone.gone = True
     for k in range(10):
         far.update(estimate(9000 + k)._replace(**wild, flexibility_torque_nm=-1e-5), 100.0 + k)
     for width in (60, 80, 100, 120, 160):
-        shown = lines(joints_table({"elbow": filled(), "wrist": filled(1), "far": far}, width), width)
+        shown = lines(joints_table({"elbow": filled(), "wrist": gone, "far": far}, width), width)
+        assert len(shown) == 4 and "daemon gone" in "".join(shown)
         assert all(len(line) <= width and "…" not in line for line in shown), shown
 
 

@@ -1,7 +1,5 @@
 """The motion to record next: within its limits, played by the simulated drives, told by the report."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -24,14 +22,14 @@ MOTION = (
 )
 
 
-def limits() -> Limits:
+def limits():
     names = ("low_rad", "high_rad", "velocity_rad_s", "acceleration_rad_s2", "torque_nm")
     return Limits(
         **{name: np.array([value]) for name, value in zip(names, (-0.6, 0.6, 3.0, 30.0, 12.0), strict=True)}
     )
 
 
-def written(folder: Path, excitation: str, name: str = "run.csv") -> tuple[Path, Path]:
+def written(folder, excitation, name="run.csv"):
     """The elbow with backlash, moved so, and its recording of 12 s."""
     joint = folder / "elbow.toml"
     text = ELBOW.read_text(encoding="utf-8")

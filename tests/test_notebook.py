@@ -1,11 +1,8 @@
 """The notebook that goes from a recording to a better model runs, and what it shows is stored in it."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -14,7 +11,7 @@ from drivelink import jointfile
 ROOT = Path(__file__).parents[1]
 
 
-def runner() -> ModuleType:
+def runner():
     spec = importlib.util.spec_from_file_location("docs_notebook", ROOT / "docs" / "notebook.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

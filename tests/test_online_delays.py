@@ -13,7 +13,7 @@ LATE_S = 0.0093  # a filtered and forwarded current, as on a measured drive line
 SETTLED = slice(4000, None)
 
 
-def _motion(t: np.ndarray, spin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _motion(t, spin):
     """Motor position, torque of the drive and deflection of a linear joint, in closed form (eq 5)."""
     waves = ((0.4, 5.0, 0.0), (0.1, 17.0, 0.4), (0.02, 41.0, 1.1))
     theta = spin * t + sum(a * np.sin(w * t + p) for a, w, p in waves)
@@ -23,7 +23,7 @@ def _motion(t: np.ndarray, spin: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     return theta, B * acceleration + D * rate - K * phi, phi
 
 
-def _joint(link_late_s: float) -> JointModel:
+def _joint(link_late_s):
     torque = Effect(name="torque_delay", parameters={"delay_s": -LATE_S})
     link = Effect(name="encoder_delay", parameters={"delay_s": link_late_s})
     spring = Transmission(model="linear")

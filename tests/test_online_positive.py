@@ -1,7 +1,5 @@
 """A stiffness that is not above zero, or whose interval holds zero, is never valid and never written."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """What is written: whole or not at all, never in the place of what was read, nothing replaced unasked."""
 
-from __future__ import annotations
-
 import errno
 import os
 import resource
@@ -42,8 +40,7 @@ def test_a_file_is_written_in_one_step_and_keeps_its_mode_and_its_links(folder):
     link.symlink_to(path)
     before = path.stat().st_ino
     write_whole(link, b"second", force=True)
-    assert path.read_text() == "second" and link.is_symlink()
-    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert path.read_text() == "second" and link.is_symlink() and stat.S_IMODE(path.stat().st_mode) == 0o640
     assert path.stat().st_ino != before  # another file took its place: nobody saw it grow
 
 
@@ -61,7 +58,7 @@ def test_without_force_an_existing_file_stays_even_one_that_came_meanwhile(folde
 
 
 def test_a_file_system_without_hard_links_is_written_too(folder, monkeypatch):
-    def refused(*_: object) -> None:
+    def refused(*_):
         raise OSError(errno.EPERM, "Operation not permitted")
 
     monkeypatch.setattr(os, "link", refused)
@@ -147,29 +144,20 @@ def test_a_kill_at_any_moment_leaves_the_old_file_or_the_new_one(tmp_path):
 
 
 def test_a_recording_takes_the_place_of_another_one_with_its_first_block(folder):
-    path = folder / "r.csv"
+    path, joint = folder / "r.csv", parse(JOINT)
     path.write_text("an older recording")
-    joint = parse(JOINT)
     with pytest.raises(RecordingError, match="File exists"):
         open_sink(path, joint)
+    open_sink(folder / "none.csv", joint).abandon()  # never began: it leaves nothing
+    open_sink(path, joint, force=True).abandon()
+    assert list(folder.iterdir()) == [path] and path.read_text() == "an older recording"
     sink = open_sink(path, joint, force=True)
-    sink.sample(Sample(0, (0.0,), (0.0,), (0.0,), 0.0), 0)
-    assert path.read_text() == "an older recording"
-    sink.flush()
-    assert path.read_text().startswith("time_s,") and path.read_text().count("\n") == 2
-    sink.sample(Sample(1, (0.0,), (0.0,), (0.0,), 0.0), 0)
-    sink.flush()
-    assert path.read_text().count("\n") == 3
+    for k in range(2):
+        sink.sample(Sample(k, (0.0,), (0.0,), (0.0,), 0.0), 0)
+        assert k or path.read_text() == "an older recording"
+        sink.flush()
+        assert path.read_text().startswith("time_s,") and path.read_text().count("\n") == 2 + k
     sink.close()
-
-
-def test_a_recording_that_never_began_leaves_nothing(folder):
-    kept = folder / "kept.csv"
-    kept.write_text("an older recording")
-    for path, force in ((folder / "r.csv", False), (kept, True)):
-        sink = open_sink(path, parse(JOINT), force=force)
-        sink.abandon()
-    assert sorted(folder.iterdir()) == [kept] and kept.read_text() == "an older recording"
 
 
 def test_a_full_disk_cuts_a_recording_at_a_whole_block(folder):
@@ -259,21 +247,15 @@ def test_fit_brings_its_own_joint_file_up_to_date_in_one_step(files, monkeypatch
     assert cli.main(arguments) == 2 and "--force replaces it" in capsys.readouterr().err
     before = joint.read_text()
 
-    def killed(*_: object, **__: object) -> None:
+    def killed(*_, **__):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(written, "put_in_place", killed)
         assert cli.main([*arguments, "--force"]) == 130
     assert joint.read_text() == before
-    assert cli.main([*arguments, "--force"]) == 0
-    assert "# my own remark" in joint.read_text()
-    assert cli.main([*arguments, "--force"]) == 0  # and again, from what it wrote
-
-
-def test_a_results_folder_holds_what_the_last_run_found(files):
-    recording, joint = files
-    out = recording.parent / "fit"
-    for _ in range(2):
-        assert cli.main(["fit", str(recording), "--joint", str(joint), "--out", str(out), "--plots"]) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["fit.json", "fit.png"]
+    out = recording.parent / "fit"  # results: what the last run found
+    for _ in range(2):  # and again, from what it wrote
+        assert cli.main([*arguments, "--force", "--out", str(out), "--plots"]) == 0
+        assert "# my own remark" in joint.read_text()
+        assert sorted(path.name for path in out.iterdir()) == ["fit.json", "fit.png"]

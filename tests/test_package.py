@@ -1,7 +1,5 @@
 """What is installed: one compiled core of the same version, and every file that the package reads."""
 
-from __future__ import annotations
-
 import os
 import runpy
 import subprocess

@@ -1,7 +1,5 @@
 """Plots: one style, legible without colour, the same file for the same data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -10,7 +8,7 @@ from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_
 from drivelink.output.plots import stiffness_against_deflection as against_deflection
 
 
-def wave(n: int = 20_000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def wave(n=20_000):
     t = np.arange(n) * 1e-3
     phi = 0.1 * np.sin(t)
     return t, phi, 100.0 + 3000.0 * phi**2

@@ -1,7 +1,5 @@
 """Progress: nothing for quick work, a bar on a terminal, plain lines elsewhere."""
 
-from __future__ import annotations
-
 import io
 from types import SimpleNamespace
 

@@ -2,25 +2,24 @@
 
 import itertools
 import struct
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
-from daemonkit import DaemonRig, Listener, rig, vsa
+from daemonkit import Listener, rig, vsa
 
 from drivelink.canopen.layout import Signal
 from estimator.sample import Status
 
-OFTEN = "read_back_s = 0.05"
+OFTEN, ROUND = "read_back_s = 0.02", 2000  # cycles: a round of all objects then, and more
 CONFIRMED = 2500  # cycles: every object of three nodes has been asked for once
 
 
-def forge(made: DaemonRig, node: int, address: tuple[int, int], number: int, times: int) -> None:
+def forge(made, node, address, number, times):
     """Somebody else answers for this object, before the node does."""
     server = made.node(node).sdo
     left, inner = [times], server.send_response
 
-    def send(data: bytes) -> None:
+    def send(data):
         if left[0] and data[0] & 0xE0 == 0x40 and struct.unpack_from("<HB", data, 1) == address:
             left[0] -= 1
             inner(data[:4] + number.to_bytes(4, "little"))
@@ -30,7 +29,7 @@ def forge(made: DaemonRig, node: int, address: tuple[int, int], number: int, tim
 
 
 @contextmanager
-def carrying(made: DaemonRig, node: int, change: Callable[[bytes], bytes]) -> Iterator[None]:
+def carrying(made, node, change):
     """Meanwhile the node's first frame carries something else."""
     tpdo = made.node(node).tpdos[made.tpdo(node)[0]]
     inner = tpdo.emit
@@ -93,7 +92,7 @@ def test_a_node_that_says_other_units_time_after_time_is_not_used():
         entry, answers = made.node(2).dictionary.find(0x6076, 0), itertools.count(1000)
         right = entry.value
 
-        def drift() -> None:
+        def drift():
             entry.value = next(answers)
 
         entry.refresh = drift
@@ -109,11 +108,11 @@ def test_a_node_that_says_other_units_time_after_time_is_not_used():
 
 def test_a_unit_that_changes_in_the_run_has_the_node_configured_anew():
     with rig(vsa(bus=OFTEN)) as made:
-        made.run(CONFIRMED)
+        made.run(ROUND)
         before = scales(made, 1)[Signal.MOTOR_TORQUE]
         entry = made.node(1).dictionary.find(0x6076, 0)
         entry.value = 2 * entry.value
-        made.run(5000)  # more than a round of all objects
+        made.run(ROUND)  # more than a round of all objects
         said = [text for text in made.events if "0x6076:00 was" in text]
         assert len(said) == 1
         assert said[0].startswith("node 1: ")
@@ -123,15 +122,15 @@ def test_a_unit_that_changes_in_the_run_has_the_node_configured_anew():
 
 def test_a_frame_that_carries_another_object_than_is_mapped_is_contradicted_until_it_does():
     with rig(vsa(bus=OFTEN)) as made:
-        made.run(CONFIRMED)
+        made.run(ROUND)
         other = itertools.count(123_456, 7)
         with carrying(made, 1, lambda data: struct.pack("<i", next(other)) + data[4:]):
-            made.run(5000)
+            made.run(ROUND)
             assert any("as 0x6064:00, by SDO it is" in text for text in made.events)
-            last = made.run(2000)
+            last = made.run(1000)
             assert all(e.status & Status.CONTRADICTED and not e.status & Status.VALID for e in last)
             suspected = made.status["suspected"]
         assert (suspected["signal"], suspected["motor"]) == ("motor_position", 1)
         assert suspected["reason"] == "contradicted"
-        end = made.run(5000)
+        end = made.run(ROUND)
         assert not end[-1].status & Status.CONTRADICTED

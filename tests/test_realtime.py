@@ -11,14 +11,14 @@ from types import SimpleNamespace
 import pytest
 from canlayouts import VSA, vsa_cycle
 
-from drivelink._core import Assembler, JointPipeline, Tick
+from drivelink._core import Assembler, JointPipeline
 from drivelink.cycle import realtime
 from drivelink.cycle.housekeeping import Housekeeping
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.sources import CanFrame
 from drivelink.systemd import unit
 from drivelink.systemd.unit import Watchdog, notify, watchdog_period_s
-from estimator.sample import Estimate, Sample
+from estimator.sample import Estimate
 
 MS = 1_000_000
 
@@ -33,7 +33,7 @@ def test_what_was_taken_is_given_back():
 
 
 def test_what_is_refused_is_a_plain_line_with_the_remedy(monkeypatch):
-    def refuse(*_: object) -> None:
+    def refuse(*_):
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
@@ -60,53 +60,34 @@ class Echo:
     """A bus whose devices answer SYNC at once, and that can make the loop late."""
 
     def __init__(self) -> None:
-        self.lost_sends = 0
-        self.errors: dict[str, int] = {}
-        self.pending: list[CanFrame] = []
-        self.syncs = 0
-        self.delay: dict[int, float] = {}
+        self.lost_sends, self.errors, self.pending, self.syncs, self.delay = 0, {}, [], 0, {}
+        self.narrow = lambda _cob_ids: None
 
-    def wait(self, timeout_s: float) -> bool:
+    def wait(self, timeout_s):
         return bool(self.pending)
 
-    def take(self) -> list[CanFrame]:
+    def take(self):
         frames, self.pending = self.pending, []
         return frames
 
-    def send(self, cob_id: int, data: bytes) -> None:
+    def send(self, cob_id, data):
         self.syncs += 1
         self.pending = [CanFrame(*frame, 0) for frame in vsa_cycle(self.syncs)]
         threading.Event().wait(self.delay.pop(self.syncs, 0.0))
 
-    def narrow(self, cob_ids: object) -> None:
-        pass
 
-
-class Last:
-    """An estimator that only repeats the sequence."""
-
-    residual_nm = 0.0
-
-    def step(self, sample: Sample) -> Estimate:
-        return Estimate(sample.sequence, 1, 0.0, 0.0, 0.0, ())
-
-    def lose_zeros(self) -> None:
-        pass
-
-    def parameters(self) -> list[dict[str, object]]:
-        return []
-
-    def suspicion(self) -> None:
-        return None
+# An estimator that only repeats the sequence.
+LAST = SimpleNamespace(
+    residual_nm=0.0, step=lambda sample: Estimate(sample.sequence, 1, 0.0, 0.0, 0.0, ()), lose_zeros=lambda: None,
+    parameters=list, suspicion=lambda: None,
+)  # fmt: skip
 
 
 class Stamps:
-    def __init__(self, stop_after: int) -> None:
-        self.stop_after = stop_after
-        self.seen: list[tuple[int, int]] = []
-        self.loop: CycleLoop | None = None
+    def __init__(self, stop_after):
+        self.stop_after, self.seen, self.loop = stop_after, [], None
 
-    def put(self, tick: Tick) -> None:
+    def put(self, tick):
         self.seen.append((tick.estimate.sequence, tick.stamp_ns))
         if len(self.seen) >= self.stop_after and self.loop is not None:
             self.loop.stop()
@@ -115,7 +96,7 @@ class Stamps:
 def test_deadlines_move_by_whole_periods_and_late_cycles_are_left_out_as_gaps():
     source, sink = Echo(), Stamps(100)
     source.delay = {20: 0.005, 50: 0.0101}
-    loop_joint = LoopJoint("x", JointPipeline(Assembler(VSA, 2), Last()), sink)
+    loop_joint = LoopJoint("x", JointPipeline(Assembler(VSA, 2), LAST), sink)
     loop = sink.loop = CycleLoop(source, [loop_joint], period_s=0.001)
     realtime.run(loop)
     assert loop.overruns >= 4 + 9

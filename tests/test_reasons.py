@@ -1,7 +1,5 @@
 """Why an estimate is not valid: one sentence, and a limit that the user declares."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Raw CAN logs: the variants found in the wild, as annotated lines, and files that a crash cut off."""
 
-from __future__ import annotations
-
 import logging
 import random
 
@@ -63,7 +61,7 @@ def test_stamps_that_are_differences_are_added_up(tmp_path, caplog):
     assert "added up" in caplog.text
 
 
-def many_frames(n: int = 3000) -> list[LoggedFrame]:
+def many_frames(n=3000):
     rng, ids, begin = random.Random(1), (0x080, 0x181, 0x182, 0x18A), 1_700_000_000_000_000_000
     return [
         LoggedFrame(begin + 250_000 * k, ids[k % 4], rng.randbytes(8) if k % 4 else b"", "can0")
@@ -132,11 +130,11 @@ def test_a_file_that_is_no_log_is_one_clear_line(name, content, line, tmp_path):
     assert line in str(caught.value) and "\n" not in str(caught.value)
 
 
-def syncs(stamps_ms: list[float]) -> list[LoggedFrame]:
+def syncs(stamps_ms):
     return [LoggedFrame(round(1e6 * t), 0x080, b"", "can0") for t in stamps_ms]
 
 
-def jumps(stamps_ms: list[float]) -> list[int]:
+def jumps(stamps_ms):
     return [jump for _, jump in numbered_ahead(syncs(stamps_ms), 1e-3)]
 
 

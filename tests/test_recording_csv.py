@@ -1,7 +1,5 @@
 """CSV recordings: what is understood, what is mended and said, and what is one clear line."""
 
-from __future__ import annotations
-
 import logging
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,12 +19,12 @@ DRIVE = "[motor.drive]\nnode_id = 1\ntorque_constant_nm_a = 0.05\ngear_ratio = 5
 COLUMNS = ("time_s", "motor1_position_rad", "motor1_torque_nm", "link_position_rad")
 
 
-def rows(n: int = 50, period_s: float = 0.001, start_s: float = 0.0) -> np.ndarray:
+def rows(n=50, period_s=0.001, start_s=0.0):
     k = np.arange(n)
     return np.column_stack((start_s + k * period_s, np.sin(0.01 * k), np.cos(0.01 * k), np.sin(0.011 * k)))
 
 
-def write(path: Path, table: np.ndarray, names: tuple[str, ...] = COLUMNS, separator: str = ",") -> Path:
+def write(path, table, names=COLUMNS, separator=","):
     lines = [separator.join(names), *(separator.join(map(repr, row)) for row in table.tolist())]
     path.write_text("\n".join(lines) + "\n")
     return path

@@ -4,8 +4,6 @@ The texts and bytes below are made here from the formats' descriptions, not by a
 Each holds two joints, nodes of strangers, remote, extended and error frames, and begins in the middle.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import struct
@@ -25,7 +23,7 @@ CYCLES = 400
 BEGIN_S = 1_736_000_000.25
 
 
-def joint_text(name: str, node: int, mapped: bool = True) -> str:
+def joint_text(name, node, mapped=True):
     tpdo = (
         f'[[motor.drive.tpdo]]\ncob_id = {0x180 + node}\nobjects = ["0x6064:00:32", "0x60E4:01:32"]\n'
         f'[[motor.drive.tpdo]]\ncob_id = {0x280 + node}\nobjects = ["0x6077:00:16"]\n'
@@ -47,7 +45,7 @@ class Line(NamedTuple):
     kind: str = "data"  # data, remote, extended, error
 
 
-def truth(node: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def truth(node):
     """(cycles,) counts of motor and link, torque in thousandths of 2 N·m."""
     k = np.arange(CYCLES)
     motor = np.round(9000 * np.sin(0.02 * k * node)).astype(int)
@@ -55,7 +53,7 @@ def truth(node: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return motor, link, np.round(300 * np.cos(0.02 * k * node)).astype(int)
 
 
-def bus() -> list[Line]:
+def bus():
     signals = {node: truth(node) for node in (1, 5)}
     lines = [
         Line(-2e-4, 0x285, struct.pack("<h", 7)),
@@ -76,11 +74,11 @@ def bus() -> list[Line]:
     return lines
 
 
-def spaced(data: bytes) -> str:
+def spaced(data):
     return data.hex(" ").upper()
 
 
-def candump(lines: list[Line], *, width: int = 3) -> bytes:
+def candump(lines, *, width=3):
     out = []
     for t, can_id, data, kind in lines:
         payload = "R" if kind == "remote" else data.hex().upper()
@@ -91,7 +89,7 @@ def candump(lines: list[Line], *, width: int = 3) -> bytes:
     return "".join(out).encode()
 
 
-def vector_asc(lines: list[Line], *, base: str = "hex", stamps: str = "absolute", fd: bool = False) -> bytes:
+def vector_asc(lines, *, base="hex", stamps="absolute", fd=False):
     out = [
         "date Sat Jan 4 02:13:20.250 pm 2025\r\n",
         f"base {base}  timestamps {stamps}\r\n",
@@ -139,7 +137,7 @@ PEAK_ERRORS = {
 }
 
 
-def peak_trc(lines: list[Line], version: str) -> bytes:
+def peak_trc(lines, version):
     out = [";##########################################################################\r\n"]
     if version != "1.0":
         out = [f";$FILEVERSION={version}\r\n", ";$STARTTIME=45661.5928269676\r\n"]
@@ -156,7 +154,7 @@ def peak_trc(lines: list[Line], version: str) -> bytes:
     return "".join(out).encode("cp1252")
 
 
-def vector_blf(lines: list[Line]) -> bytes:
+def vector_blf(lines):
     """Objects of the header's version 1 in containers that are not packed; one object reaches into the next."""
     objects = b""
     for t, can_id, data, kind in lines:

@@ -1,7 +1,5 @@
 """Recordings that lie about their size, that are cut, or that are damaged: one line, and little memory."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -10,7 +8,6 @@ import struct
 import time
 import zlib
 from contextlib import contextmanager
-from pathlib import Path
 
 import can
 import lz4.frame
@@ -66,7 +63,7 @@ def lz4_bomb():
         return b"".join([*parts, packer.flush()])
 
 
-def chunk(compression: bytes, packed: bytes, size: int) -> bytes:
+def chunk(compression, packed, size):
     body = struct.pack("<QQQII", 0, 0, size, 0, len(compression)) + compression
     body += struct.pack("<Q", len(packed)) + packed
     return struct.pack("<BQ", 0x06, len(body)) + body
@@ -140,7 +137,7 @@ def test_a_gap_of_a_million_seconds_is_replayed_and_not_fitted(tmp_path):
 # Damage
 
 
-def log_of(path: Path, wanted: list[tuple[int, int, bytes]]) -> None:
+def log_of(path, wanted):
     sink = open_sink(path, JOINT, TEXT)
     for stamp, can_id, data in wanted:
         sink.frame(stamp, can_id, data)
@@ -187,7 +184,7 @@ def test_no_cut_of_a_log_makes_another_frame(suffix, tmp_path, caplog):
     assert "the last line has no end and is omitted" in caplog.text
 
 
-def mcap_of(path: Path, messages: list[tuple[str, int, bytes]]) -> Path:
+def mcap_of(path, messages):
     """An MCAP file of (topic, stamp in ns, data), its messages in compressed chunks."""
     records, numbers = bytearray(), {}
     for topic, stamp, data in messages:

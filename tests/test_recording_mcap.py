@@ -1,7 +1,5 @@
 """MCAP recordings: bit for bit, by an independent reader, and after everything that may go wrong."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -36,23 +34,23 @@ JOINT = parse(TEXT)
 BEGIN_NS = 1_700_000_000_000_000_000
 
 
-def sample(k: int) -> Sample:
+def sample(k):
     rng = random.Random(k)
     velocity = math.nan if k % 3 else rng.gauss(0, 1)
     return Sample(k, (rng.gauss(0, 1),), (velocity,), (rng.gauss(0, 1e6),), rng.gauss(0, 1e-9))
 
 
-def estimate(k: int, status: int = 3) -> EstimateMessage:
+def estimate(k, status=3):
     one = TransmissionEstimate(k / 3, 700.0 + k, math.inf if k < 5 else 3.0, k * 1e-3)
     return EstimateMessage(k, BEGIN_NS + k * 1_000_000, status, k / 3, 700.0 + k, 3.0, (one,))
 
 
-def external(k: int) -> ExternalMessage:
+def external(k):
     status = (1 if k >= 5 else 0) | (2 if k >= 400 else 0)
     return ExternalMessage(k, BEGIN_NS + k * 1_000_000, status, k / 7 if k >= 5 else math.nan, 0.5)
 
 
-def record(path: Path, n: int = 500, close: bool = True) -> None:
+def record(path, n=500, close=True):
     sink = open_sink(path, JOINT, TEXT)
     for k in range(n):
         stamp_ns = BEGIN_NS + k * 1_000_000
@@ -70,7 +68,7 @@ def record(path: Path, n: int = 500, close: bool = True) -> None:
         sink.abandon()
 
 
-def bits(one: Sample) -> bytes:
+def bits(one):
     values = (*one.motor_position_rad, *one.motor_velocity_rad_s, *one.motor_torque_nm, *one[4:])
     return struct.pack(f"<q{len(values)}d", one.sequence, *values)
 

@@ -1,14 +1,11 @@
 """`drivelink record`: what a daemon and a bus say, into a file, with nothing sent to either."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
 import sys
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 import daemonkit
 import pytest
@@ -17,7 +14,7 @@ import zenohkit
 from drivelink import cli, jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.cli.record import _Summary
-from drivelink.cycle.sources import CanFrame, FrameSource
+from drivelink.cycle.sources import CanFrame
 from drivelink.recording import read
 from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink
@@ -26,7 +23,7 @@ from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.recorder import BusTap, Recorder
 
 
-def joint_file(folder: Path, endpoint: str) -> Path:
+def joint_file(folder, endpoint):
     path = folder / "elbow.toml"
     path.write_text(
         'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.125\n[motor.transmission]\nmodel = "linear"\n'
@@ -46,7 +43,7 @@ def start(*arguments):
         process.communicate()
 
 
-def samples_in(path: Path) -> int:
+def samples_in(path):
     """How many samples are on the disk so far."""
     if not path.exists() or not path.stat().st_size:
         return 0
@@ -125,11 +122,11 @@ def test_what_cannot_be_recorded_is_one_line(arguments, line, tmp_path, capsys):
 class InRealTime:
     """A bus in lockstep, with the stamps that one in real time would have given."""
 
-    def __init__(self, source: FrameSource) -> None:
+    def __init__(self, source):
         self._source = source
         self._syncs = 0
 
-    def take(self) -> list[CanFrame]:
+    def take(self):
         frames = []
         for cob_id, data, _ in self._source.take():
             self._syncs += cob_id == 0x080

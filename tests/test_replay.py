@@ -1,7 +1,5 @@
 """Replay: the same pipeline, bit for bit, from every format; and what the command leaves behind."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 import json
@@ -12,7 +10,6 @@ import struct
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import can
 import daemonkit
@@ -40,7 +37,7 @@ FORMATS = (".log", ".blf", ".asc", ".trc", ".mcap", ".csv")
 CYCLES = 400
 
 
-def bits(estimate: Estimate) -> bytes:
+def bits(estimate):
     values = [*estimate[2:5], *(value for one in estimate.transmissions for value in one)]
     return struct.pack(f"<qI{len(values)}d", estimate.sequence, int(estimate.status), *values)
 
@@ -48,7 +45,7 @@ def bits(estimate: Estimate) -> bytes:
 class Recorded:
     """A daemon in lockstep with its devices, all its frames and estimates recorded in every format."""
 
-    def __init__(self, folder, text, disturb=None, cycles=CYCLES, formats=FORMATS) -> None:
+    def __init__(self, folder, text, disturb=None, cycles=CYCLES, formats=FORMATS):
         self.folder = folder
         self.joint = parse(text)
         self.tap = can.Bus(interface="virtual", channel=self.joint.bus.channel)
@@ -74,7 +71,7 @@ class Recorded:
             sink.close()
         self.tap.shutdown()
 
-    def drain(self) -> None:
+    def drain(self):
         """Write what was on the bus, with the stamps that a bus in real time would have given."""
         while (message := self.tap.recv(0)) is not None:
             if message.arbitration_id == 0x080:
@@ -83,7 +80,7 @@ class Recorded:
                 late_ns = 0 if message.arbitration_id == 0x080 else 150_000
                 sink.frame(self.stamp_ns + late_ns, message.arbitration_id, bytes(message.data))
 
-    def replayed(self, suffix: str, frames: bool | None = None) -> list[Estimate]:
+    def replayed(self, suffix, frames=None):
         path = self.folder / f"r{suffix}"
         playback = open_playback(path, self.joint, self.folder, frames=frames)
         return [played.tick.estimate for played in playback]
@@ -147,7 +144,7 @@ def another_object(rig):
     rig.faults.at(syncs + 2500, lambda: forge(rig, 2, (0x6076, 0), 5000, times=1))
 
 
-def another_mapping(rig: daemonkit.DaemonRig) -> None:
+def another_mapping(rig):
     """Somebody else exchanges two objects of node 1's frame, which keeps its identifier and length."""
     number, cob_id = rig.tpdo(1)
     other = daemonkit.Listener(rig.joint)
@@ -157,7 +154,7 @@ def another_mapping(rig: daemonkit.DaemonRig) -> None:
         steps.append((mapping, place, one.index << 16 | one.subindex << 8 | one.bits, 4))
     steps += [(mapping, 0, len(entries), 1), (0x17FF + number, 1, cob_id, 4)]
 
-    def write() -> None:
+    def write():
         for index, subindex, value, size in steps:
             head = bytes([0x23 | (4 - size) << 2]) + index.to_bytes(2, "little") + bytes([subindex])
             other.send(0x601, head + value.to_bytes(size, "little").ljust(4, b"\0"))
@@ -296,7 +293,7 @@ parameters = { k_nm_rad = 150.0 }
 """
 
 
-def write_csv(path: Path, n: int, nan_row: int | None = None) -> Path:
+def write_csv(path, n, nan_row=None):
     t = np.arange(n) * 0.002
     theta, q = 0.2 * np.sin(3 * t), 0.25 * np.sin(3 * t - 0.1)
     tau = 0.125 * -1.8 * np.sin(3 * t) + 0.8 * 0.6 * np.cos(3 * t) - 150.0 * (q - theta)

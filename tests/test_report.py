@@ -1,11 +1,8 @@
 """`drivelink diagnose`: report.json as promised, a page of its own, a joint file that knows the effect."""
 
-from __future__ import annotations
-
 import json
 import re
 from functools import cache
-from pathlib import Path
 
 import diagnosiskit as kit
 import fleetkit
@@ -33,7 +30,7 @@ def folder(tmp_path_factory):
 
 
 @cache  # what was diagnosed once is looked at by several tests
-def _diagnose(folder: Path, name: str, joint: str = "joint.toml", *more: str) -> dict:  # type: ignore[type-arg]
+def _diagnose(folder, name, joint="joint.toml", *more):  # type: ignore[type-arg]
     out = folder / f"{name}-{joint}"
     arguments = ["diagnose", str(folder / f"{name}.csv"), "--joint", str(folder / joint), "--out", str(out)]
     assert main([*arguments, *more]) == 0
@@ -63,6 +60,7 @@ def test_the_written_joint_file_knows_the_effect_and_its_floor(folder, name, eff
     assert _diagnose(folder, name, better)["verdict"] == "sufficient"
 
 
+@pytest.mark.slow  # what is found is tested in test_diagnosis
 def test_an_unlisted_effect_comes_with_its_curve(folder):
     effect = _diagnose(folder, "bump")["effects"][0]
     assert (effect["name"], effect["location"], effect["coordinates"]) == ("unlisted", "motor", ["position"])

@@ -19,7 +19,7 @@ DRIVE = {"motor_counts": 8192, "link_bits": 16, "velocity_rad_s": None}
 class RecordedJoint:
     """Soft joints on one motion; from a time on they rest."""
 
-    def __init__(self, N: int = 6, rest_at: float = math.inf) -> None:
+    def __init__(self, N=6, rest_at=math.inf):
         rng, n = np.random.default_rng(21), 9000
         K = rng.uniform(80, 220, (N, 1))
         self.alpha = np.stack([K, K * rng.uniform(2, 12, (N, 1))], axis=-1)
@@ -195,26 +195,19 @@ def test_no_float_makes_a_tick_raise(rows, mode, model):
 
 @pytest.mark.slow
 def test_vsa_ii_is_found_from_nothing_on_both_sides():
-    n = 10_000
-    t = np.arange(n) * T
-    torque, stiffness = joints.vsa_ii(np.array(0.5), np.array(1.75))
-    B = np.full((1, 2), 0.02)
-    plants = joints.Plants(torque, stiffness, B, B, 0.05, 0.01, 0.0)
-    tau = np.zeros((n, 1, 2))
-    tau[:, 0, 0] = 0.06 * np.sin(2 * np.pi * 0.5 * t) + 0.05 * np.sin(2 * np.pi * 1.3 * t)
-    tau[:, 0, 1] = 0.06 * np.sin(2 * np.pi * 0.7 * t) - 0.05 * np.sin(2 * np.pi * 1.7 * t)
-    truth = joints.simulate(plants, tau, T)
+    t, B = np.arange(10_000) * T, np.full((1, 2), 0.02)
+    plants = joints.Plants(*joints.vsa_ii(np.array(0.5), np.array(1.75)), B, B, 0.05, 0.01, 0.0)
+    waves = [(0.5, 1.3, 0.05), (0.7, 1.7, -0.05)]
+    tau = [0.06 * np.sin(2 * np.pi * a * t) + size * np.sin(2 * np.pi * b * t) for a, b, size in waves]
+    truth = joints.simulate(plants, np.stack(tau, axis=-1)[:, None], T)
     record = joints.record(truth, 0, T, motor_counts=65536, link_bits=18, velocity_rad_s=None)
-    estimator = make_estimator(
-        joints.joint_model(0.02, 0.02, model="vsa-ii", order=None, m=2), EstimatorSettings(), T
-    )
-    out = np.array([estimator.step(sample)[:5] for sample in record.samples()])
+    model = joints.joint_model(0.02, 0.02, model="vsa-ii", order=None, m=2)
+    estimator = make_estimator(model, EstimatorSettings(), T)
+    out = np.array([estimator.step(sample)[:5] for sample in record.samples()])[6000:]
     for reported in estimator.parameters():
         assert reported["model"] == "vsa-ii"
-        assert reported["parameters"]["k_nm_rad"] == pytest.approx(0.5, rel=5e-3)
-        assert reported["parameters"]["c"] == pytest.approx(1.75, rel=5e-3)
-    late = slice(6000, None)
-    assert out[late, 3] == pytest.approx(truth.sigma[late, 0].sum(1), rel=0.02)
+        assert reported["parameters"] == pytest.approx({"k_nm_rad": 0.5, "c": 1.75}, rel=5e-3)
+    assert out[:, 3] == pytest.approx(truth.sigma[6000:, 0].sum(1), rel=0.02)
 
 
 @pytest.mark.slow
@@ -227,40 +220,37 @@ def test_what_a_nonlinear_model_is_declared_with_does_not_matter_after_some_seco
     B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
     plants = joints.Plants(torque, stiffness, B, D, 0.45, 0.3, 3.0)
     truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, 8.0, 3.0), T)
-    late = slice(8000, None)
-    inside = []
+    late, inside = slice(8000, None), []
     for j in range(N):
-        noise = rng.normal(0, 0.04, (n, 1))
-        record = joints.record(
-            truth, j, T, motor_counts=8192, link_bits=17, velocity_rad_s=None, torque_noise=noise
-        )
-        found = []
+        how, found = {**DRIVE, "link_bits": 17, "torque_noise": rng.normal(0, 0.04, (n, 1))}, []
         for k_off, c_off in ((1.0, 1.0), (0.8, 1.2)):
             declared = {"k_nm_rad": k_off * k[j, 0], "c": 1.0 + c_off * (c[j, 0] - 1.0)}
             model = joints.joint_model(B[j, 0], D[j, 0], model="vsa-ii", order=None, parameters=declared)
-            estimator = make_estimator(model, EstimatorSettings(), T)
-            out = np.array([estimator.step(sample)[:5] for sample in record.samples()])[late]
+            out, sigma = (
+                joints.estimates(model, joints.record(truth, j, T, **how))[late],
+                truth.sigma[late, j, 0],
+            )
             found.append(out[:, 3])
-            inside.append(np.mean(np.abs(out[:, 3] - truth.sigma[late, j, 0]) < 1.96 * out[:, 4]))
-            error = out[:, 3] / truth.sigma[late, j, 0] - 1
-            assert np.sqrt(np.mean(error**2)) < 2e-3
+            inside.append(np.mean(np.abs(out[:, 3] - sigma) < 1.96 * out[:, 4]))
+            assert np.sqrt(np.mean((out[:, 3] / sigma - 1) ** 2)) < 2e-3
         assert found[1] == pytest.approx(found[0], rel=1e-3)
     assert np.mean(inside) > 0.85  # eight draws of what is slow to change
 
 
 def test_serial_takes_the_first_transmission_and_asks_for_a_rigid_second():
-    flexible = Motor(
-        inertia_kg_m2=0.1, transmission=Transmission(model="linear", parameters={"k_nm_rad": 50.0})
-    )
+    spring = Transmission(model="linear", parameters={"k_nm_rad": 50.0})
+    flexible = Motor(inertia_kg_m2=0.1, transmission=spring)
     rigid = Motor(inertia_kg_m2=0.01, transmission=Transmission(model="none"))
-    estimator = make_estimator(
-        JointModel(arrangement="serial", motors=(flexible, rigid)), EstimatorSettings(), T
-    )
+
+    def serial(*motors):
+        return make_estimator(JointModel(arrangement="serial", motors=motors), EstimatorSettings(), T)
+
+    estimator = serial(flexible, rigid)
     for k in range(30):
         out = estimator.step(Sample(k, (0.0, 0.2), (math.nan,) * 2, (0.0, 0.0), 0.01))
     assert out.stiffness_nm_rad == out.transmissions[0].stiffness_nm_rad == 50.0
     with pytest.raises(ValueError, match="serial"):
-        make_estimator(JointModel(arrangement="serial", motors=(flexible, flexible)), EstimatorSettings(), T)
+        serial(flexible, flexible)
 
 
 # What is called valid is right, whatever reaches the estimator: gaps, garbage, glitches, any joint.

@@ -180,7 +180,7 @@ def test_a_stiffness_says_of_which_moment_it_is_and_whether_it_is_valid(ros2, st
     assert stiffness.state(10.0 + 2 * ros2_stiffness.STALE_S) == "stale"
 
 
-def stamp_of(message) -> int:
+def stamp_of(message):
     """The stamp in the attachment of rmw_zenoh, ns."""
     return struct.unpack("<q", message.attachment.to_bytes()[8:16])[0]
 

@@ -1,7 +1,5 @@
 """The systemd service: what is written, what systemd says of it, and what is left after uninstall."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -44,7 +42,7 @@ def files_in(root):
     return [path for path in root.rglob("*") if path.is_file()]
 
 
-def service(*words: object) -> int:
+def service(*words):
     return cli.main(["service", *map(str, words)])
 
 

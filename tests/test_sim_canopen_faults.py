@@ -1,19 +1,17 @@
 """Faults: each does to the wire what its name says, and no more."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import contextmanager
 
 import pytest
-from simkit import StubRig, Wire, wired
+from simkit import StubRig, wired
 
 from sim.canopen.drive import Cia402Drive
 from sim.faults import Faults
 
 
 @contextmanager
-def operational() -> Iterator[tuple[Wire, Faults, Cia402Drive, Cia402Drive]]:
+def operational():
     """Two drives that answer each SYNC with TPDO2 alone."""
     rig = StubRig()
     first, second = Cia402Drive(1, rig, 0), Cia402Drive(2, rig, 1)
@@ -25,11 +23,11 @@ def operational() -> Iterator[tuple[Wire, Faults, Cia402Drive, Cia402Drive]]:
         yield wire, Faults(wire.network), first, second
 
 
-def ids(frames: list[str]) -> list[str]:
+def ids(frames):
     return [frame[:3] for frame in frames]
 
 
-def position(frame: str) -> int:
+def position(frame):
     return int.from_bytes(bytes.fromhex(frame[4:])[:4], "little", signed=True)
 
 

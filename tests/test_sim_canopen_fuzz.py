@@ -1,8 +1,7 @@
 """Whatever arrives, a simulated device neither raises nor forgets how to answer."""
 
-from __future__ import annotations
-
 import random
+import struct
 
 import pytest
 from simkit import StubRig, wired
@@ -21,31 +20,26 @@ _INDICES = (
 _WORDS = (0x60640020, 0x60410010, 0x60770010, 0x60E40120, 0x40000181, 0xC0000281, 0x181, 1, 2, 10, 0xFF)
 
 
-def request(draw: random.Random) -> bytes:
+_COMMANDS = (0x40, 0x2F, 0x2B, 0x23, 0x21, 0x20, 0x60, 0x70, 0x00, 0x10, 0xA4, 0xA3, 0xA2, 0xA1)
+
+
+def request(draw):
     """An SDO request that is often nearly right."""
-    command = draw.choice(
-        (0x40, 0x2F, 0x2B, 0x23, 0x21, 0x20, 0x60, 0x70, 0x00, 0x10, 0xA4, 0xA3, 0xA2, 0xA1)
-    )
-    if draw.random() < 0.1:
-        command = draw.randrange(256)
-    index = draw.choice(_INDICES)
+    command = draw.randrange(256) if draw.random() < 0.1 else draw.choice(_COMMANDS)
+    index, subindex = draw.choice(_INDICES), draw.choice((0, 0, 1, 2, 3, 8))
     value = draw.choice(_WORDS) if draw.random() < 0.8 else draw.randrange(1 << 32)
-    return bytes([command, index & 0xFF, index >> 8, draw.choice((0, 0, 1, 2, 3, 8))]) + value.to_bytes(
-        4, "little"
-    )
+    return struct.pack("<BHBI", command, index, subindex, value)
 
 
-def frame(draw: random.Random) -> tuple[int, bytes]:
-    kind = draw.random()
+def frame(draw):
+    kind, data = draw.random(), draw.randbytes(draw.randrange(9))
     if kind < 0.5:
         return 0x601, request(draw)
     if kind < 0.7:
         return 0x80, draw.randbytes(draw.choice((0, 0, 0, 0, 1, 8)))
     if kind < 0.8:
         return 0, bytes([draw.choice((1, 2, 0x80, 0x81, 0x82, 7)), draw.choice((0, 1, 2))])
-    if kind < 0.9:
-        return draw.choice((0x201, 0x301, 0x401, 0x501, 0x702)), draw.randbytes(draw.randrange(9))
-    return draw.randrange(0x800), draw.randbytes(draw.randrange(9))
+    return (draw.choice((0x201, 0x301, 0x401, 0x501, 0x702)) if kind < 0.9 else draw.randrange(0x800)), data
 
 
 @pytest.mark.parametrize(

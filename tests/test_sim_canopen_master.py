@@ -1,10 +1,7 @@
 """An independent master (python-canopen) with our EDS files against the simulated devices."""
 
-from __future__ import annotations
-
 import itertools
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -19,7 +16,6 @@ from drivelink.canopen.bus import interface_is_up
 from sim.canopen.drive import Cia402Drive, DriveData
 from sim.canopen.edsfile import eds_directory, node_eds
 from sim.canopen.encoder import Cia406Encoder, EncoderData
-from sim.canopen.node import Node
 from sim.canopen.profiles import PROFILES, profile
 from sim.network import Network
 
@@ -40,7 +36,7 @@ BUSES = [
 
 
 @contextmanager
-def mastered(*nodes: Node, rig: StubRig, interface: str = "virtual") -> Iterator[canopen.Network]:
+def mastered(*nodes, rig, interface="virtual"):
     """A served network and a master on the same bus."""
     channel = f"master-{next(_channels)}" if interface == "virtual" else "vcan0"
     with can.Bus(interface=interface, channel=channel) as device_end:
@@ -56,19 +52,19 @@ def mastered(*nodes: Node, rig: StubRig, interface: str = "virtual") -> Iterator
             master.disconnect()
 
 
-def device(eds: str, rig: StubRig) -> Node:
+def device(eds, rig):
     """What an EDS file describes."""
     quirks = EDS[eds]
     return Cia402Drive(1, rig, 0, quirks=profile(quirks)) if quirks else Cia406Encoder(1, rig, EncoderData())
 
 
-def remote(master: canopen.Network, eds: str = "cia402-drive.eds") -> canopen.RemoteNode:
+def remote(master, eds="cia402-drive.eds"):
     node = master.add_node(1, str(eds_directory() / eds))
     node.sdo.RESPONSE_TIMEOUT = PATIENCE_S
     return node
 
 
-def variables(od: canopen.ObjectDictionary) -> Iterator[ODVariable]:
+def variables(od):
     for described in (described for described in od.values() if described.index >= 0x1000):
         if isinstance(described, ODVariable):
             yield described
@@ -153,7 +149,7 @@ def test_a_master_maps_saves_reads_back_and_receives(interface):
         got = threading.Event()
         values: list[int] = []
 
-        def received(pdo: canopen.pdo.PdoMap) -> None:
+        def received(pdo):
             values[:] = [variable.raw for variable in pdo]
             got.set()
 

@@ -1,7 +1,5 @@
 """The network of devices: lockstep, served by a thread, over TCP."""
 
-from __future__ import annotations
-
 import itertools
 import socket
 import threading
@@ -20,7 +18,7 @@ from sim.network import Network
 PATIENCE_S = 60.0  # only ever waited for when something is broken
 
 
-def sync(stamp_s: float = 0.0) -> can.Message:
+def sync(stamp_s=0.0):
     return can.Message(arbitration_id=0x80, is_extended_id=False, timestamp=stamp_s)
 
 
@@ -58,13 +56,13 @@ def test_in_lockstep_a_sync_is_one_period_however_long_the_caller_takes_and_fore
 class ScriptedBus(can.BusABC):
     """Hands out given frames, then fails, then ends its reader."""
 
-    def __init__(self, frames: list[can.Message | Exception], stop: threading.Event) -> None:
+    def __init__(self, frames, stop):
         super().__init__(channel="script")
         self.frames = frames
         self.stop = stop
         self.sent: list[can.Message] = []
 
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+    def _recv_internal(self, timeout):
         if not self.frames:
             self.stop.set()
             return None, False
@@ -73,11 +71,11 @@ class ScriptedBus(can.BusABC):
             raise frame
         return frame, False
 
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+    def send(self, msg, timeout=None):
         self.sent.append(msg)
 
 
-def served_ticks(stamps_s: list[float]) -> list[int]:
+def served_ticks(stamps_s):
     """Ticks of the world after each SYNC that arrives at these times (relative to now)."""
     rig = StubRig()
     stop = threading.Event()
@@ -128,7 +126,7 @@ def test_without_a_sync_the_world_follows_the_wall_clock():
         assert set(threading.enumerate()) <= before
 
 
-def clients(server: SocketcandServer, count: int) -> list[can.BusABC]:
+def clients(server, count):
     """Connected clients; the server is served meanwhile."""
     with ThreadPoolExecutor(1) as pool:
         how = {"interface": "socketcand", "channel": "vcan0", "host": "127.0.0.1", "port": server.port}
@@ -138,7 +136,7 @@ def clients(server: SocketcandServer, count: int) -> list[can.BusABC]:
         return made.result()
 
 
-def exchange(server: SocketcandServer, client: can.BusABC) -> tuple[int, bytes] | None:
+def exchange(server, client):
     """What the client receives, with the server served meanwhile."""
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:

@@ -1,9 +1,9 @@
 """Each maker's habits, as a master meets them on the wire."""
 
-from __future__ import annotations
+from contextlib import contextmanager
 
 import pytest
-from simkit import StubRig, Wire, wired
+from simkit import StubRig, wired
 
 from sim.canopen.drive import Cia402Drive, DriveData
 from sim.canopen.profiles import PROFILES, profile
@@ -12,17 +12,21 @@ from sim.errors import SimError
 NO_OBJECT, NO_SUBINDEX, READ_ONLY = 0x06020000, 0x06090011, 0x06010002
 
 
-def drive(rig: StubRig, name: str) -> Cia402Drive:
-    return Cia402Drive(1, rig, 0, DriveData(link_counts_per_rev=262144), profile(name))
+@contextmanager
+def powered(name):
+    rig = StubRig()
+    with wired(Cia402Drive(1, rig, 0, DriveData(link_counts_per_rev=262144), profile(name)), rig=rig) as wire:
+        wire.booted = wire.power_on()
+        yield wire
 
 
-def abort_of_read(wire: Wire, index: int, subindex: int = 0) -> int:
+def abort_of_read(wire, index, subindex=0):
     (answer,) = wire.send(0x601, bytes([0x40, index & 0xFF, index >> 8, subindex, 0, 0, 0, 0]))
     data = bytes.fromhex(answer.split(" ", 1)[1])
     return int.from_bytes(data[4:8], "little") if data[0] == 0x80 else 0
 
 
-def map_tpdo2(wire: Wire, *, flags: int = 0x40000000) -> list[int]:
+def map_tpdo2(wire, *, flags=0x40000000):
     """Standard order; the abort codes."""
     objects = (0x60640020, 0x60770010, 0x60410010)
     return [
@@ -36,10 +40,8 @@ def map_tpdo2(wire: Wire, *, flags: int = 0x40000000) -> list[int]:
 
 
 @pytest.mark.parametrize("name", [name for name, quirks in PROFILES.items() if not quirks.fixed_mapping])
-def test_the_standard_order_maps_every_profile_and_sync_brings_the_frame(name: str) -> None:
-    rig = StubRig()
-    with wired(drive(rig, name), rig=rig) as wire:
-        wire.power_on()
+def test_the_standard_order_maps_every_profile_and_sync_brings_the_frame(name):
+    with powered(name) as wire:
         wire.wait(2.0)  # for the slow one
         wire.say("000 80 00")  # for the self-starting ones
         assert map_tpdo2(wire) == [0] * 8
@@ -81,10 +83,8 @@ HABITS: dict[str, list[str | tuple[int, ...]]] = {
 
 
 @pytest.mark.parametrize("name", HABITS)
-def test_a_drive_has_its_makers_habits(name: str) -> None:
-    rig = StubRig()
-    with wired(drive(rig, name), rig=rig) as wire:
-        wire.power_on()
+def test_a_drive_has_its_makers_habits(name):
+    with powered(name) as wire:
         for step in HABITS[name]:
             if isinstance(step, str):
                 wire.say(step)
@@ -96,50 +96,47 @@ def test_a_drive_has_its_makers_habits(name: str) -> None:
                 assert wire.read(1, *step[:2]) == step[2], step
 
 
-def test_a_roboteq_like_drive_refuses_to_lose_bit_30_and_starts_itself() -> None:
-    rig = StubRig()
-    with wired(drive(rig, "roboteq"), rig=rig) as wire:
-        assert wire.power_on() == ["701 00", "181 50 02"]
+def test_a_roboteq_like_drive_refuses_to_lose_bit_30_and_starts_itself():
+    with powered("roboteq") as wire:
+        assert wire.booted == ["701 00", "181 50 02"]
         wire.say("000 80 00")
         assert wire.write(1, 0x1801, 1, 0x80000281, 4) == 0x06090030
         assert map_tpdo2(wire) == [0] * 8
 
 
-def test_bit_10_toggles_with_each_sample_and_not_with_sdo_reads() -> None:
-    rig = StubRig()
-    with wired(drive(rig, "el72x1"), rig=rig) as wire:
-        wire.power_on()
+def test_bit_10_toggles_with_each_sample_and_not_with_sdo_reads():
+    with powered("el72x1") as wire:
         wire.say("000 01 00")
         words = []
         for _ in range(4):
-            frames = [frame for frame in wire.say("080") if frame.startswith("281")]
-            words.append(int(frames[0].split()[8] + frames[0].split()[7], 16) & 0x0400)
+            (parts,) = [frame.split() for frame in wire.say("080") if frame.startswith("281")]
+            words.append(int(parts[8] + parts[7], 16) & 0x0400)
             wire.read(1, 0x6041)
         assert words in ([0, 0x400, 0, 0x400], [0x400, 0, 0x400, 0])
 
 
 @pytest.mark.parametrize(("name", "kept"), [("strict", False), ("keeps-pdos", True)])
-def test_reset_communication_restores_pdos_or_keeps_them(name: str, kept: bool) -> None:
-    rig = StubRig()
-    with wired(drive(rig, name), rig=rig) as wire:
-        wire.power_on()
-        before = [wire.read(1, 0x1A01, k) for k in range(4)]
-        wire.write(1, 0x1801, 1, 0xC0000281, 4)
-        wire.write(1, 0x1A01, 0, 0, 1)
-        wire.write(1, 0x1A01, 1, 0x606C0020, 4)
-        wire.write(1, 0x1A01, 0, 1, 1)
-        changed = [wire.read(1, 0x1A01, k) for k in range(4)]
+def test_reset_communication_restores_pdos_or_keeps_them(name, kept):
+    with powered(name) as wire:
+        mapped = lambda: [wire.read(1, 0x1A01, k) for k in range(4)]  # noqa: E731
+        before = mapped()
+        for entry in (
+            (0x1801, 1, 0xC0000281, 4),
+            (0x1A01, 0, 0, 1),
+            (0x1A01, 1, 0x606C0020, 4),
+            (0x1A01, 0, 1, 1),
+        ):
+            wire.write(1, *entry)
+        changed = mapped()
         wire.say("000 82 00")
-        assert [wire.read(1, 0x1A01, k) for k in range(4)] == (changed if kept else before)
+        assert mapped() == (changed if kept else before) != (before if kept else changed)
         wire.say("000 81 00")
-        assert [wire.read(1, 0x1A01, k) for k in range(4)] == before
+        assert mapped() == before
 
 
-def test_stored_parameters_survive_a_reset_and_restored_defaults_end_them() -> None:
+def test_stored_parameters_survive_a_reset_and_restored_defaults_end_them():
     save, load = int.from_bytes(b"save", "little"), int.from_bytes(b"load", "little")
-    rig = StubRig()
-    with wired(drive(rig, "strict"), rig=rig) as wire:
-        wire.power_on()
+    with powered("strict") as wire:
         wire.write(1, 0x1017, 0, 100, 2)
         wire.write(1, 0x6072, 0, 500, 2)
         assert wire.write(1, 0x1010, 2, save, 4) == 0  # communication only
@@ -152,15 +149,14 @@ def test_stored_parameters_survive_a_reset_and_restored_defaults_end_them() -> N
         assert wire.read(1, 0x1017) == 0
 
 
-def test_a_slow_device_boots_in_its_own_time() -> None:
-    rig = StubRig()
-    with wired(drive(rig, "slow-boot"), rig=rig) as wire:
-        assert wire.power_on() == []
+def test_a_slow_device_boots_in_its_own_time():
+    with powered("slow-boot") as wire:
+        assert wire.booted == []
         assert wire.wait(1.4) == []
         assert wire.say("601 40 00 10 00 00 00 00 00") == []
         assert wire.wait(0.2) == ["701 00"]
 
 
-def test_an_unknown_profile_is_one_line_with_the_known_ones() -> None:
+def test_an_unknown_profile_is_one_line_with_the_known_ones():
     with pytest.raises(SimError, match=r"expected one of strict, epos4, .*got \"acme\""):
         profile("acme")

@@ -1,7 +1,5 @@
 """The CiA 402 state machine against the standard's table of transitions."""
 
-from __future__ import annotations
-
 import pytest
 
 from sim.canopen.drive import PowerState as P

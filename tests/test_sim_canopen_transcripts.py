@@ -1,17 +1,14 @@
 """The simulated devices, byte for byte on the wire."""
 
-from __future__ import annotations
-
 import pytest
 from simkit import TRANSCRIPTS, StubRig, play, wired
 
 from sim.canopen.drive import Cia402Drive, DriveData
 from sim.canopen.encoder import Cia406Encoder, EncoderData
-from sim.canopen.node import Node
 from sim.canopen.profiles import profile
 
 
-def device(name: str, rig: StubRig) -> Node:
+def device(name, rig):
     if name == "encoder":
         return Cia406Encoder(1, rig, EncoderData(counts_per_rev=65536, range_counts=65536 * 4096))
     return Cia402Drive(1, rig, 0, DriveData(link_counts_per_rev=262144), profile("strict"))

@@ -1,7 +1,5 @@
 """The paper's three cases."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -10,31 +8,23 @@ from sim.errors import SimError
 from sim.world import record
 
 
-def test_constant_and_quadratic_have_the_papers_data_in_si() -> None:
-    for name in ("constant", "quadratic"):
-        plant = case(name).plant
-        (motor,) = plant.motors
-        assert (motor.inertia_kg_m2, motor.viscous_damping_nm_s_rad) == (0.05, 0.001)
-        assert (plant.link.inertia_kg_m2, plant.link.viscous_damping_nm_s_rad) == (0.1, 0.0001)
-        assert plant.link.gravity_nm == 0.025
-    assert case("constant").plant.motors[0].law().torque(0.2) == pytest.approx(0.02)
-    assert case("quadratic").plant.motors[0].law().torque(0.2) == pytest.approx(0.02 + 0.5 * 0.008)
+@pytest.mark.parametrize(("name", "torque_nm"), [("constant", 0.02), ("quadratic", 0.02 + 0.5 * 0.008)])
+def test_constant_and_quadratic_have_the_papers_data_in_si(name, torque_nm):
+    plant = case(name).plant
+    (motor,) = plant.motors
+    assert (motor.inertia_kg_m2, motor.viscous_damping_nm_s_rad) == (0.05, 0.001)
+    assert (plant.link.inertia_kg_m2, plant.link.viscous_damping_nm_s_rad) == (0.1, 0.0001)
+    assert plant.link.gravity_nm == 0.025 and motor.law().torque(0.2) == pytest.approx(torque_nm)
 
 
-def test_vsa_ii_has_the_papers_springs_and_two_sines() -> None:
+def test_vsa_ii_has_the_papers_springs_two_sines_and_the_deflections_that_its_polynomials_were_fitted_on():
     vsa = case("vsa-ii")
     for motor in vsa.plant.motors:
         assert motor.spring.parameters == {"k_nm_rad": 0.5, "c": 1.75}
         assert motor.law().stiffness(0.0) == pytest.approx(0.140625)
     r = record(vsa.world(), 10.0)
-    t = r["time_s"]
-    assert r["truth_motor1_torque_nm"] == pytest.approx(0.1 * np.sin(0.1 * np.pi * t))
-    assert r["truth_motor2_torque_nm"] == pytest.approx(0.1 * np.sin(0.2 * np.pi * t))
-
-
-def test_vsa_ii_reaches_the_deflections_that_the_papers_polynomials_were_fitted_on() -> None:
-    r = record(case("vsa-ii").world(), 10.0)
-    for motor in ("motor1", "motor2"):
+    for motor, pace in (("motor1", 0.1), ("motor2", 0.2)):
+        assert r[f"truth_{motor}_torque_nm"] == pytest.approx(0.1 * np.sin(pace * np.pi * r["time_s"]))
         phi, torque = r[f"truth_{motor}_deflection_rad"], r[f"truth_{motor}_flexibility_torque_nm"]
         assert 0.45 < np.abs(phi).max() < 0.6
         powers = np.stack([phi ** (2 * h - 1) for h in range(1, 6)], axis=1)
@@ -44,7 +34,7 @@ def test_vsa_ii_reaches_the_deflections_that_the_papers_polynomials_were_fitted_
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_every_case_declares_what_it_assumes_and_stays_in_range(name: str) -> None:
+def test_every_case_declares_what_it_assumes_and_stays_in_range(name):
     found = case(name)
     assert found.name == name and len(found.assumed) >= 4
     assert all(entry.quantity and entry.value and entry.reason for entry in found.assumed)

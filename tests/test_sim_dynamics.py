@@ -1,7 +1,5 @@
 """The joint of eqs 4-7: laws, equations, integration."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 
@@ -16,9 +14,7 @@ from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 SPRINGS = [LINEAR, HARDENING, VSA_II, EXPONENTIAL]
 
 
-def run(
-    plant: JointPlant, state: list[float], seconds: float, step_s: float, tau: float = 0.0
-) -> list[float]:
+def run(plant, state, seconds, step_s, tau=0.0):
     step = integrator(plant, step_s)
     for _ in range(round(seconds / step_s)):
         step(state, tau, 0.0, 0.0)
@@ -95,7 +91,7 @@ def test_integration_converges_with_order_four(motors):
     plant = sea(HARDENING, motors=motors)
     start = [0.4, 0.0, 0.3, 0.0, 0.35, 0.0][: 2 + 2 * motors]
 
-    def end(steps: int) -> np.ndarray:
+    def end(steps):
         return np.array(run(plant, list(start), 0.5, 0.5 / steps, 3.0))
 
     exact = end(4000)

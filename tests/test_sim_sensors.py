@@ -1,7 +1,5 @@
 """Drives and encoders report what real ones would: counts, per milles, revolutions per minute, noise."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import islice
@@ -24,9 +22,7 @@ DRIVE = DriveHardware(
 )
 
 
-def recorded(
-    drive: DriveHardware, encoder: LinkEncoder = PERFECT_ENCODER, **kwargs: int
-) -> dict[str, np.ndarray]:
+def recorded(drive, encoder=PERFECT_ENCODER, **kwargs):
     return record(World(sea(), (drive,), encoder, excitation=build(EXCITATION, 1), **kwargs), 3.0)
 
 

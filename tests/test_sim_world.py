@@ -1,7 +1,5 @@
 """The world in lockstep: periods, set-points, rows, determinism."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -19,7 +17,7 @@ from sim.world import World, record
 NOISY = DriveHardware(gear_ratio=50.0, current_noise_a=0.01)
 
 
-def world(seed: int = 0, **kwargs: object) -> World:
+def world(seed=0, **kwargs):
     return World(sea(), (NOISY,), excitation=build(EXCITATION, 1), seed=seed, **kwargs)
 
 

@@ -1,14 +1,12 @@
 """Joint file to simulated world and devices."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 
 from drivelink.demo.simulate import assumptions, bench_from_joints, nodes_from_joint, world_from_joint
 from drivelink.errors import JointFileError, UsageError
-from drivelink.jointfile import JointFile, parse
+from drivelink.jointfile import parse
 from sim.canopen.drive import Cia402Drive
 from sim.canopen.encoder import Cia406Encoder
 
@@ -52,7 +50,7 @@ case = "vsa-ii"
 """
 
 
-def joint(text: str = SINGLE, extra: str = "") -> JointFile:
+def joint(text=SINGLE, extra=""):
     return parse(text + extra)
 
 

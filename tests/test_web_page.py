@@ -1,14 +1,11 @@
 """The script of the live view's page, run by node on what the server sends: reading values, pause, axes, the end."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -31,7 +28,7 @@ SPAN = """
 """
 
 
-def fed(seconds: float = 4.0, wild: float | None = None) -> JointView:
+def fed(seconds=4.0, wild=None):
     """A joint whose torque is a sine of 2 N·m; one torque of it may be wild."""
     view = JointView("elbow")
     for k in range(int(1000 * seconds)):
@@ -44,7 +41,7 @@ def fed(seconds: float = 4.0, wild: float | None = None) -> JointView:
     return view
 
 
-def page(scenario: str, *views: JointView) -> Any:
+def page(scenario, *views):
     """What a scenario returns; `sent[i]` is what the server sends of each view."""
     script = re.search(r"<script>(.*)</script>", PAGE.read_text(encoding="utf-8"), re.DOTALL)[1]
     sent = json.dumps([{"joints": {view.name: snapshot(view, True, {})}} for view in views])

@@ -99,6 +99,4 @@ def test_every_motion_moves_the_joint_and_pushes_only_where_somebody_pushes(worl
 )
 def test_a_wrong_setting_is_one_line(world, setting, says):
     code, _, error = world(setting)
-    assert code == 2
-    assert says in error
-    assert error.count("\n") == 1
+    assert code == 2 and says in error and error.count("\n") == 1

@@ -1,10 +1,8 @@
 """The fault script on a real SocketCAN: daemon, devices and a third party on vcan1, in real time."""
 
-from collections.abc import Iterator
-
 import pytest
 from daemonkit import vsa
-from faultscript import SCRIPT, Fault
+from faultscript import SCRIPT
 from faultstages import RealStage
 
 from drivelink.canopen.bus import interface_is_up
@@ -17,7 +15,7 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def stage() -> Iterator[RealStage]:
+def stage():
     made = RealStage(vsa(channel=CHANNEL, bus='interface = "socketcan"\nperiod_s = 0.01'))
     try:
         made.settle()
@@ -27,8 +25,6 @@ def stage() -> Iterator[RealStage]:
 
 
 @pytest.mark.parametrize("fault", [f for f in SCRIPT if f.where != "lockstep"], ids=lambda fault: fault.name)
-def test_each_fault_is_flagged_said_once_and_survived_without_a_restart(
-    stage: RealStage, fault: Fault
-) -> None:
+def test_each_fault_is_flagged_said_once_and_survived_without_a_restart(stage, fault):
     stage.settle()
     stage.play(fault)

@@ -1,7 +1,6 @@
 """Foreign peers on a real SocketCAN, at rates that an emulated kernel carries."""
 
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -45,7 +44,7 @@ sdo_timeout_s = 0.5
 
 
 @pytest.mark.parametrize("period_s", [0.01, 0.004])
-def test_python_canopens_sync_is_one_master_and_its_period_is_measured(period_s: float) -> None:
+def test_python_canopens_sync_is_one_master_and_its_period_is_measured(period_s):
     bus = open_bus(SECTION)
     network = canopen.Network(bus=can.Bus(interface="socketcan", channel=CHANNEL))
     network.connect()
@@ -71,7 +70,7 @@ def test_python_canopens_sync_is_one_master_and_its_period_is_measured(period_s:
     )  # one master, as the daemon counts
 
 
-def test_frames_that_the_kernel_dropped_because_nobody_read_them_are_counted() -> None:
+def test_frames_that_the_kernel_dropped_because_nobody_read_them_are_counted():
     bus = open_bus(SECTION)
     bus.socket.setsockopt(1, 8, 4096)  # SOL_SOCKET, SO_RCVBUF: a few frames
     source = SocketCanSource(bus)
@@ -92,7 +91,7 @@ def test_frames_that_the_kernel_dropped_because_nobody_read_them_are_counted() -
 
 
 @contextmanager
-def slave() -> Iterator[tuple[canopen.Network, canopen.LocalNode]]:
+def slave():
     """A slave of another make: python-canopen's `LocalNode` with a drive's sheet, in its own thread."""
     network = canopen.Network(bus=can.Bus(interface="socketcan", channel=CHANNEL))
     network.connect()
@@ -102,12 +101,12 @@ def slave() -> Iterator[tuple[canopen.Network, canopen.LocalNode]]:
         network.disconnect()
 
 
-def answer_syncs(network: canopen.Network, node: canopen.LocalNode) -> None:
+def answer_syncs(network, node):
     """Send every enabled TPDO at each SYNC: position 1000 + k, torque -k at the kth, packed by python-canopen."""
     node.tpdo.read()
     count = [0]
 
-    def answer(_cob_id: int, _data: bytearray, _stamp: float) -> None:
+    def answer(_cob_id, _data, _stamp):
         for tpdo in (tpdo for tpdo in node.tpdo.values() if tpdo.enabled and tpdo.trans_type == 1):
             for variable in tpdo.map:
                 if variable.index == 0x6064:
@@ -120,7 +119,7 @@ def answer_syncs(network: canopen.Network, node: canopen.LocalNode) -> None:
     network.subscribe(SYNC_COB_ID, answer)
 
 
-def test_another_makers_slave_is_configured_and_what_it_sends_is_decoded() -> None:
+def test_another_makers_slave_is_configured_and_what_it_sends_is_decoded():
     with slave() as (network, node):
         bus = open_bus(SECTION)
         try:
@@ -129,7 +128,7 @@ def test_another_makers_slave_is_configured_and_what_it_sends_is_decoded() -> No
             assembler, decoded = Assembler((layout,), 1), []
             source = SocketCanSource(bus)
 
-            def sampled(count: int) -> bool:
+            def sampled(count):
                 """Whether the slave has answered so many SYNCs."""
                 frames = [frame for frame in source.take() if frame.cob_id != SYNC_COB_ID]
                 decoded.extend(filter(None, [assembler.feed(frame.cob_id, frame.data) for frame in frames]))

@@ -7,7 +7,6 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,12 +29,12 @@ pytestmark = [
 REPOSITORY = Path(__file__).parents[2]
 
 
-def ip(*arguments: str) -> None:
+def ip(*arguments):
     subprocess.run(["ip", "link", *arguments], check=True)
 
 
 @contextmanager
-def source(channel: str = CHANNEL) -> Iterator[SocketCanSource]:
+def source(channel=CHANNEL):
     bus = open_bus(BusSection(interface="socketcan", channel=channel))
     try:
         opened = open_source(bus)
@@ -46,7 +45,7 @@ def source(channel: str = CHANNEL) -> Iterator[SocketCanSource]:
 
 
 @contextmanager
-def peer(channel: str = CHANNEL) -> Iterator[can.BusABC]:
+def peer(channel=CHANNEL):
     with can.Bus(interface="socketcan", channel=channel, fd=True) as bus:
         yield bus
 

@@ -174,6 +174,8 @@ def test_no_estimate_ends_a_view(name):
 
 def test_tokens_of_others_lock_nobody_out_fill_no_memory_and_reach_no_terminal(publisher, endpoint):
     """200 sessions that say they are the daemon, and write nothing; then a new subscriber. And joints made up."""
+    session = open_client(endpoint)
+    watcher = Watcher(session)
     with rogue(endpoint) as intruder:
         names = [f"drivelink/elbow/alive/{k:032x}" for k in range(200)]
         names += [f"drivelink/\x1b[2J[bold]{k}/alive" for k in range(300)]
@@ -183,8 +185,6 @@ def test_tokens_of_others_lock_nobody_out_fill_no_memory_and_reach_no_terminal(p
             until(lambda: publish(publisher) and joint.valid)
             assert joint.daemon == str(publisher._session.zid())
             until(lambda: publish(publisher) and joint.rivals == 200)
-        session = open_client(endpoint)
-        watcher = Watcher(session)
 
         def polled():
             publish(publisher)
@@ -193,9 +193,9 @@ def test_tokens_of_others_lock_nobody_out_fill_no_memory_and_reach_no_terminal(p
 
         until(lambda: (view := polled()) and view.history.latest)
         assert not any("\x1b" in name for name in watcher.views)
-        watcher.close()
-        close_session(session)
         assert len(tokens) == 500
+    watcher.close()
+    close_session(session)
 
 
 FORGED = {

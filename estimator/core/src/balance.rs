@@ -46,7 +46,7 @@ pub const LARGEST: f64 = 1.5;
 
 const FRICTION_SPEED: f64 = 0.02; // of the largest velocity: over which dry friction changes its sign …
 const SOFTER: f64 = 10.0; // … and the same of the softer one: between them lie the usual Stribeck speeds
-const STOP_WIDTHS: [f64; 3] = [0.1, 0.3, 0.6]; // of half the range of u: a memory of one width lies between two
+const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
 const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len(); // columns that are functions of the raw φ
 const FORMED: usize = 9; // columns of lightly filtered signals: dry, soft, load ×2, late, read, stops ×3
@@ -332,6 +332,20 @@ impl Balance {
             }
         }
         (torque, stiffness)
+    }
+
+    /// Variance of σ inside a piece of the free curve, (N·m/rad)²; `clips`: its columns' amplitudes, `stiffness`: σ there.
+    ///
+    /// A curve of which only the mean slope of a piece is known, and that lies between its neighbours' slopes m and M,
+    /// varies by (M − s)(s − m) at most (Bhatia and Davis, "A better bound on the variance", American Mathematical
+    /// Monthly 107(4), 2000); a gap's edge does. In the middle no slope is below 0.
+    #[must_use]
+    pub fn within_piece(&self, phi: f64, clips: &[f64], stiffness: f64) -> f64 {
+        let range = self.size.range;
+        let Some(k) = CLIP_WIDTHS.iter().position(|width| phi.abs() < width * range) else { return 0.0 };
+        let outwards = -clips[k] / range;
+        let inwards = if k == 0 { -stiffness.max(0.0) } else { clips[k - 1] / range };
+        (-outwards * inwards).max(0.0)
     }
 
     /// Filtered θ′, rad/s.

@@ -64,7 +64,7 @@ fn a_stop_remembers_which_way_it_came() {
     balance.grow(0.01);
     balance.fit_widths(0.0);
     moved(&mut balance, 0, 4000, 0.01);
-    assert!(balance.extras(0.0).0[STOPS.start].abs() > 0.05);
+    assert!(balance.extras(0.0).0[STOPS.start].abs() > 0.5 * STOP_WIDTHS[0]);
     assert_eq!(balance.extras(0.0).1[STOPS.start], 0.0);
 }
 
@@ -82,4 +82,24 @@ fn columns_that_have_grown_are_those_of_a_joint_that_was_larger_from_the_start()
     for column in SPRING.chain(SLOPE) {
         assert!((before[column] * factors[column] - after[column]).abs() < 1e-12, "{column}");
     }
+}
+
+/// A gap's edge inside a piece: its slope is the mean of 0 and K over it, its variance known in closed form.
+#[test]
+fn a_piece_with_an_edge_is_as_uncertain_as_the_edge_makes_it() {
+    let mut balance = Balance::new(Family::Smooth);
+    moved(&mut balance, 0, 3000, 1.0);
+    balance.grow(1.0);
+    balance.fit_widths(0.0);
+    let (range, k, below) = (balance.size.range, 100.0, 0.3);
+    // Slopes of the pieces: 0, then the edge's, then k: what the clips take off k.
+    let mean = k * (1.0 - below);
+    let clips = [-mean * range, (mean - k) * range, 0.0, 0.0];
+    let variance = |piece: usize, stiffness: f64| {
+        balance.within_piece(0.99 * CLIP_WIDTHS[piece] * range, &clips, stiffness)
+    };
+    assert!((variance(1, mean) - k * k * below * (1.0 - below)).abs() < 1e-9);
+    assert_eq!((variance(0, 0.0), variance(2, k)), (0.0, 0.0));
+    // In the middle the next slope is all that is known.
+    assert!((variance(0, 20.0) - 20.0 * mean).abs() < 1e-9);
 }

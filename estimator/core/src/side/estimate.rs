@@ -34,7 +34,7 @@ impl Side {
             let variance = self.blocks.posterior.as_ref().map_or(f64::NAN, |known| known.variance_along(by));
             (variance + slope.powi(2) * self.deflection.variance() + (held * value).powi(2)).sqrt()
         };
-        let stiffness_std = std(&at.by_stiffness, at.bend, stiffness);
+        let stiffness_std = std(&at.by_stiffness, at.bend, stiffness).hypot(at.within_piece.sqrt());
         let (flexibility_torque, flexibility_torque_std) = if self.fits && at.stiffness > 0.0 {
             let torque = at.torque + more.0;
             (torque, std(&at.by_torque, stiffness, torque))

@@ -19,6 +19,8 @@ pub struct Reading {
     pub by_stiffness: Vector,
     /// ∂σ/∂φ, N·m/rad².
     pub bend: f64,
+    /// Variance of σ that a free curve of few pieces leaves, (N·m/rad)².
+    pub within_piece: f64,
 }
 
 impl Spring {
@@ -45,6 +47,11 @@ impl Spring {
                 stiffness += x[unknown] * stiffer[column];
             }
         }
-        Reading { torque, stiffness, by_torque, by_stiffness, bend }
+        let within_piece = if set & crate::gram::set(CLIPS) != 0 {
+            balance.within_piece(phi, &x[CLIPS], stiffness)
+        } else {
+            0.0
+        };
+        Reading { torque, stiffness, by_torque, by_stiffness, bend, within_piece }
     }
 }

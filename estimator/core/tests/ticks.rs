@@ -61,7 +61,6 @@ fn model(law: Law, parameters: Vec<f64>, effects: bool) -> Model {
         damping_std: None,
         fit_rms: None,
         transmission: Transmission::Elastic { law, order: None, parameters, covariance: None },
-        fit_rms: None,
         effects: if effects { elements(false) } else { Vec::new() },
     };
     Model {

@@ -157,3 +157,20 @@ fn clustered_intervals_hold_correlated_errors_and_plain_ones_do_not() {
     assert!((367..=393).contains(&inside), "{inside}");
     assert!(plain_inside < 250, "{plain_inside}");
 }
+
+/// What rounding leaves of a covariance may be below zero along a direction: that direction is not known.
+#[test]
+fn a_variance_below_zero_is_no_certainty() {
+    let mut covariance = [[0.0; UNKNOWNS]; UNKNOWNS];
+    (covariance[1][1], covariance[2][2]) = (1.0, 1.0);
+    (covariance[1][2], covariance[2][1]) = (-1.1, -1.1);
+    let known = Posterior { set: set(1..3), x: [0.0; UNKNOWNS], covariance, log_evidence: 0.0 };
+    let along = |first: f64, second: f64| {
+        let mut g = [0.0; UNKNOWNS];
+        (g[1], g[2]) = (first, second);
+        known.variance_along(&g)
+    };
+    assert!((along(1.0, -1.0) - 4.2).abs() < 1e-12);
+    assert_eq!(along(1.0, 1.0), f64::INFINITY);
+    assert_eq!(along(0.0, 0.0), 0.0);
+}

@@ -342,13 +342,10 @@ fn sandwich(bread: &Matrix, middle: &Matrix, set: Set) -> Matrix {
     out
 }
 
-/// C − C P C: the covariance that errors of the rows make, as large as the noise; none where the prior decides.
+/// C P C: what the prior leaves uncertain.
 #[must_use]
-pub fn by_rows(posterior: &Posterior, prior: &Prior) -> Matrix {
-    let mut out = posterior.covariance;
-    let by_prior = sandwich(&posterior.covariance, &prior.precision, posterior.set);
-    out.iter_mut().flatten().zip(by_prior.iter().flatten()).for_each(|(c, p)| *c -= p);
-    out
+pub fn by_prior(posterior: &Posterior, prior: &Prior) -> Matrix {
+    sandwich(&posterior.covariance, &prior.precision, posterior.set)
 }
 
 #[cfg(test)]

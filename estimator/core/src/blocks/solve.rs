@@ -3,7 +3,7 @@
 use super::{Blocks, FEWEST, REACHED};
 use crate::balance;
 use crate::gram::{
-    Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, by_rows, choose, cluster, dot, log_evidence,
+    Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, by_prior, choose, cluster, dot, log_evidence,
     set, solve, unknowns,
 };
 use crate::spring::Projection;
@@ -13,7 +13,7 @@ use crate::unknowns::{ACTIVE, CANDIDATES, DRY, RATE, SOFT, SPRING, STOPS, Scale,
 const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
 const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
 const EXACT: f64 = 3e-4; // of the torque: what filters, sampling and rounding leave of a true model
-const MISSING: f64 = 0.1; // share of what no noise explains that one unknown takes in: there are some ten of them
+const ALIKE: f64 = 0.3; // share of what a missing effect does to a block that it does to all: 0 is noise, 1 one motion again and again
 const UNLIKELY: f64 = 0.05; // probability that an interval of 95 % need not hold
 const ACCUSED: f64 = 1000.0; // odds at which the declared zero is called wrong
 
@@ -287,18 +287,19 @@ impl Blocks {
     ) {
         let residual = self.residual;
         self.score(frame, &residual, chosen.set);
-        // What no noise explains is an effect that is missing: alike in all blocks, their scores do not show it.
+        // What no noise explains is an effect that is missing: what it does to a block is in the blocks' scores, what it
+        // does to all of them alike is not.
         let missing = (own - self.white - (EXACT * total.rms(balance::TORQUE)).powi(2)).max(0.0);
-        let alike = MISSING * missing * total.rows / noise;
-        let by_rows = by_rows(chosen, prior);
-        let few = self.ring.len() as f64;
-        let enough = self.ring.len() >= FEWEST;
-        let clustered = if enough { cluster(chosen, &self.scores, prior, noise) } else { None };
-        let wider = match clustered {
-            Some(freedom) => t_95(freedom),
-            None => (own / self.noise.variance).sqrt().max(1.0) * t_95(few.max(3.0)),
+        let by_prior = by_prior(chosen, prior);
+        let blocks = self.ring.len() as f64;
+        let clustered =
+            if self.ring.len() >= FEWEST { cluster(chosen, &self.scores, prior, noise) } else { None };
+        let (wider, freedom) = match clustered {
+            Some(freedom) => (1.0, freedom),
+            None => ((own / self.noise.variance).max(1.0), blocks.max(3.0)),
         };
-        let entries = chosen.covariance.iter_mut().flatten().zip(by_rows.iter().flatten());
-        entries.for_each(|(v, by_rows)| *v = *v * wider * wider + alike * by_rows);
+        let (alike, wider) = (ALIKE * blocks * missing / own, wider * t_95(freedom).powi(2));
+        let entries = chosen.covariance.iter_mut().flatten().zip(by_prior.iter().flatten());
+        entries.for_each(|(v, prior)| *v = wider * (*v + alike * (*v - prior)));
     }
 }

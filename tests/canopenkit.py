@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import can
@@ -61,55 +62,31 @@ def tpdo(number: int, cob: int, transmission_type: int, *entries: int, slots: in
     """Parameters of one TPDO; entries as index << 16 | subindex << 8 | bits."""
     communication, mapping = 0x17FF + number, 0x19FF + number
     objects = {
-        (communication, 0): u8(5),
-        (communication, 1): u32(cob, True),
-        (communication, 2): u8(transmission_type, True),
-        (communication, 3): u16(0, True),
-        (communication, 5): u16(0, True),
-        (mapping, 0): u8(len(entries), True),
-    }
-    for position in range(1, slots + 1):
-        value = entries[position - 1] if position <= len(entries) else 0
-        objects[mapping, position] = u32(value, True)
-    return objects
+        (communication, 0): u8(5), (communication, 1): u32(cob, True), (communication, 2): u8(transmission_type, True),
+        (communication, 3): u16(0, True), (communication, 5): u16(0, True), (mapping, 0): u8(len(entries), True),
+    }  # fmt: skip
+    values = (*entries, *[0] * (slots - len(entries)))
+    return objects | {(mapping, k): u32(value, True) for k, value in enumerate(values, start=1)}
 
 
 def drive_objects(node: int) -> Objects:
     """A plain CiA 402 drive with everything the standard knows."""
     objects: Objects = {
-        (0x1000, 0): u32(0x00020192),
-        (0x1005, 0): u32(0x80, True),
-        (0x1006, 0): u32(0, True),
-        (0x1008, 0): Item(b"Plain servo drive 2000", 22),
-        (0x1017, 0): u16(0, True),
-        (0x1018, 1): u32(0x1234),
-        (0x1018, 2): u32(0x77),
-        (0x1018, 3): u32(0x10002),
-        (0x1018, 4): u32(99),
+        (0x1000, 0): u32(0x00020192), (0x1005, 0): u32(0x80, True), (0x1006, 0): u32(0, True),
+        (0x1008, 0): Item(b"Plain servo drive 2000", 22), (0x1017, 0): u16(0, True),
+        (0x1018, 1): u32(0x1234), (0x1018, 2): u32(0x77), (0x1018, 3): u32(0x10002), (0x1018, 4): u32(99),
         (0x1019, 0): u8(0, True),
-        (0x6040, 0): u16(0, True, True),
-        (0x6041, 0): u16(0x0250, mappable=True),
-        (0x6060, 0): u8(0, True),
-        (0x6064, 0): u32(1000, mappable=True),
-        (0x606C, 0): u32(0, mappable=True),
-        (0x6071, 0): u16(0, True, True),
-        (0x6075, 0): u32(4000),
-        (0x6076, 0): u32(800),
-        (0x6077, 0): u16(0, mappable=True),
-        (0x6078, 0): u16(0, mappable=True),
-        (0x607E, 0): u8(0, True),
-        (0x608F, 1): u32(16384),
-        (0x608F, 2): u32(1),
-        (0x6091, 1): u32(50),
-        (0x6091, 2): u32(1),
-        (0x60A9, 0): u32(0x00B44700),
-        (0x60E4, 1): u32(2000, mappable=True),
-    }
+        (0x6040, 0): u16(0, True, True), (0x6041, 0): u16(0x0250, mappable=True), (0x6060, 0): u8(0, True),
+        (0x6064, 0): u32(1000, mappable=True), (0x606C, 0): u32(0, mappable=True),
+        (0x6071, 0): u16(0, True, True), (0x6075, 0): u32(4000), (0x6076, 0): u32(800),
+        (0x6077, 0): u16(0, mappable=True), (0x6078, 0): u16(0, mappable=True), (0x607E, 0): u8(0, True),
+        (0x608F, 1): u32(16384), (0x608F, 2): u32(1), (0x6091, 1): u32(50), (0x6091, 2): u32(1),
+        (0x60A9, 0): u32(0x00B44700), (0x60E4, 1): u32(2000, mappable=True),
+    }  # fmt: skip
     objects |= tpdo(1, NO_RTR | 0x180 + node, 255, 0x60410010)
     objects |= tpdo(2, NO_RTR | INVALID | 0x280 + node, 255, 0x60640020)
     objects |= tpdo(3, NO_RTR | INVALID | 0x380 + node, 255)
-    objects |= tpdo(4, NO_RTR | INVALID | 0x480 + node, 255)
-    return objects
+    return objects | tpdo(4, NO_RTR | INVALID | 0x480 + node, 255)
 
 
 def sheet_objects(sheet: DataSheet, node: int) -> Objects:
@@ -271,13 +248,9 @@ class Wire:
 
     def written(self) -> list[tuple[int, int, int, int]]:
         """(node, index, subindex, value) of all downloads of the master."""
+        value = partial(int.from_bytes, byteorder="little")
         return [
-            (
-                cob_id - 0x600,
-                int.from_bytes(data[1:3], "little"),
-                data[3],
-                int.from_bytes(data[4 : 8 - (data[0] >> 2 & 3)], "little"),
-            )
+            (cob_id - 0x600, value(data[1:3]), data[3], value(data[4 : 8 - (data[0] >> 2 & 3)]))
             for cob_id, data in self.sent
             if 0x601 <= cob_id <= 0x67F and data[0] >> 5 == 1
         ]

@@ -24,40 +24,33 @@ from sim.network import Network
 
 _channels = itertools.count()
 
-VSA = """
-name = "{name}"
+MOTOR = """
+[[motor]]
+inertia_kg_m2 = 0.0005
+viscous_damping_nm_s_rad = 0.005
+[motor.transmission]
+model = "vsa-ii"
+parameters = {{ k_nm_rad = 0.5, c = 1.75 }}
+[motor.drive]
+node_id = NODE
+gear_ratio = 20.0
+torque_constant_nm_a = 0.02
+"""
+VSA = f"""
+name = "{{name}}"
 arrangement = "antagonistic"
-[[motor]]
-inertia_kg_m2 = 0.0005
-viscous_damping_nm_s_rad = 0.005
-[motor.transmission]
-model = "vsa-ii"
-parameters = {{ k_nm_rad = 0.5, c = 1.75 }}
-[motor.drive]
-node_id = 1
-gear_ratio = 20.0
-torque_constant_nm_a = 0.02
-[[motor]]
-inertia_kg_m2 = 0.0005
-viscous_damping_nm_s_rad = 0.005
-[motor.transmission]
-model = "vsa-ii"
-parameters = {{ k_nm_rad = 0.5, c = 1.75 }}
-[motor.drive]
-node_id = 2
-gear_ratio = 20.0
-torque_constant_nm_a = 0.02
+{MOTOR.replace("NODE", "1")}{MOTOR.replace("NODE", "2")}
 [link.encoder]
 source = "cia406"
 node_id = 3
 [bus]
-channel = "{channel}"
+channel = "{{channel}}"
 sdo_timeout_s = 0.1
-{bus}
+{{bus}}
 [estimator]
-mode = "{mode}"
+mode = "{{mode}}"
 [zenoh]
-endpoint = "{endpoint}"
+endpoint = "{{endpoint}}"
 [sim]
 case = "vsa-ii"
 """
@@ -102,10 +95,7 @@ class DaemonRig:
         self.network: Network = network_from_joint(joint, self.bus)
         self.faults = Faults(self.network)
         self.daemon = Daemon(
-            [ServedJoint(joint=joint, path=path)],
-            publish=False,
-            real_time=False,
-            devices=self.network.poll,
+            [ServedJoint(joint=joint, path=path)], publish=False, real_time=False, devices=self.network.poll
         )
         self.collector = Collector()
         (self.loop_joint,) = self.daemon.loop.loop_joints

@@ -45,7 +45,7 @@ def run(seconds: float = 2.5) -> Record:
     return record(simulate(plants, tau[:, None, None], PERIOD_S, substeps=3), 0, PERIOD_S)
 
 
-def test_the_free_run_of_the_true_model_is_what_another_integrator_gives() -> None:
+def test_the_free_run_of_the_true_model_is_what_another_integrator_gives():
     made = free_run(run(), joint(effects=(FRICTION,)), 2.5)
     assert made.channels == ("motor1_position", "link_position", "motor1_deflection")
     assert min(made.fit_percent.values()) > 99.0
@@ -63,14 +63,14 @@ def test_the_free_run_of_the_true_model_is_what_another_integrator_gives() -> No
         {"effects": (FRICTION,), "transmission": Transmission(model="linear", parameters={"k_nm_rad": 6.0})},
     ],
 )
-def test_a_wrong_model_fits_worse(wrong: dict[str, object]) -> None:
+def test_a_wrong_model_fits_worse(wrong):
     right, worse = (
         free_run(run(), one, 0.5).fit_percent for one in (joint(effects=(FRICTION,)), joint(**wrong))
     )
     assert all(worse[name] < right[name] - 1.0 for name in ("motor1_position", "motor1_deflection"))
 
 
-def test_the_horizon_shrinks_until_a_drifting_run_fits_and_windows_with_a_gap_are_left_out() -> None:
+def test_the_horizon_shrinks_until_a_drifting_run_fits_and_windows_with_a_gap_are_left_out():
     truth = run()
     bad = joint(inertia_kg_m2=0.4)
     assert min(free_run(truth, bad, 2.5).fit_percent.values()) < 0.0
@@ -80,7 +80,7 @@ def test_the_horizon_shrinks_until_a_drifting_run_fits_and_windows_with_a_gap_ar
     assert len(free_run(replace(truth, sequence=gap), joint(), 0.5).time_s) == 2000
 
 
-def test_what_cannot_be_simulated_is_one_line_and_the_fit_figure_is_that_of_matlab_s_compare() -> None:
+def test_what_cannot_be_simulated_is_one_line_and_the_fit_figure_is_that_of_matlab_s_compare():
     with pytest.raises(EstimatorError, match=r"transmission\.parameters: expected"):
         free_run(run(1.0), joint(transmission=Transmission(model="linear")), 0.5)
     with pytest.raises(EstimatorError, match="without gaps of 5 s"):
@@ -91,7 +91,7 @@ def test_what_cannot_be_simulated_is_one_line_and_the_fit_figure_is_that_of_matl
 
 
 @pytest.mark.slow
-def test_three_lines_fit_predict_plot_and_write(tmp_path: Path) -> None:
+def test_three_lines_fit_predict_plot_and_write(tmp_path):
     sys.path.insert(0, str(EXAMPLES))
     try:
         from close_the_loop import JOINT
@@ -114,7 +114,7 @@ def test_three_lines_fit_predict_plot_and_write(tmp_path: Path) -> None:
     assert [path.name for path in found.report(tmp_path)] == ["report.json", "report.html"]
 
 
-def test_import_is_lazy_and_help_lists_what_there_is() -> None:
+def test_import_is_lazy_and_help_lists_what_there_is():
     code = (
         "import sys, pydoc, drivelink; assert not {'numpy', 'scipy', 'matplotlib', 'zenoh'} & set(sys.modules);"
         "text = pydoc.plain(pydoc.render_doc(drivelink)); assert 'fit(recordings' in text, text; assert 'subscribe' in dir(drivelink);"

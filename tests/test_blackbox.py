@@ -61,9 +61,7 @@ class Scene:
         return [(path, event_of(path).cause) for path in kept(self.path.parent / "kept", "elbow")]
 
 
-def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(tmp_path, caplog):
     scene = Scene(tmp_path)
     scene.run(500)
     scene.box.snapshot(b"garbage")
@@ -88,7 +86,7 @@ def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(
     assert "the estimator begins anew: snapshot: expected one of version" in caplog.text
 
 
-def test_memory_holds_no_more_than_is_kept_and_ten_alarms_a_minute_make_one_recording(tmp_path: Path) -> None:
+def test_memory_holds_no_more_than_is_kept_and_ten_alarms_a_minute_make_one_recording(tmp_path):
     scene = Scene(tmp_path)
     scene.run(2000)
     reach_s = 10.0 + 12.0 + 2 * AFTER_S  # before, a state before that, after, and until it is written
@@ -107,7 +105,7 @@ def test_memory_holds_no_more_than_is_kept_and_ten_alarms_a_minute_make_one_reco
         ({"state": "bus lost"}, "bus lost"),
     ],
 )
-def test_events_of_the_status_are_kept(status: dict[str, object], cause: str, tmp_path: Path) -> None:
+def test_events_of_the_status_are_kept(status, cause, tmp_path):
     scene = Scene(tmp_path)
     scene.run(20)
     for _ in range(3):
@@ -116,9 +114,7 @@ def test_events_of_the_status_are_kept(status: dict[str, object], cause: str, tm
     assert [made[1] for made in scene.finish()] == [cause]
 
 
-def test_a_full_disk_is_one_line_and_leaves_no_half_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path, monkeypatch, caplog):
     def full(*_: object) -> int:
         raise OSError(28, "No space left on device")
 
@@ -131,7 +127,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
     assert [path.name for path in (tmp_path / "kept").iterdir()] == ["elbow.day.csv"]
 
 
-def test_the_oldest_is_dropped_beyond_the_budget_and_nothing_else(tmp_path: Path) -> None:
+def test_the_oldest_is_dropped_beyond_the_budget_and_nothing_else(tmp_path):
     names = [f"elbow-2026010{day}T000000Z-model-alarm.mcap" for day in (1, 2, 3)]
     others = ["elbow-2-20250101T000000Z-change.mcap", "elbow-best.mcap", "notes.txt"]
     for name in (*names, *others):
@@ -142,9 +138,7 @@ def test_the_oldest_is_dropped_beyond_the_budget_and_nothing_else(tmp_path: Path
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([names[2], *others])
 
 
-def test_keep_without_a_black_box_says_what_it_expects(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_keep_without_a_black_box_says_what_it_expects(tmp_path, capsys):
     path = joint_file(tmp_path, zenohkit.free_endpoint())
     assert cli.main(["keep", str(path)]) == 3
     assert "recording.folder: expected the folder of the black box" in capsys.readouterr().err
@@ -153,7 +147,7 @@ def test_keep_without_a_black_box_says_what_it_expects(
     assert "no black box writes there" in capsys.readouterr().err
 
 
-def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path: Path) -> None:
+def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path):
     bus = f'interface = "socketcand"\noptions = {{ host = "127.0.0.1", port = {free_port()} }}\nperiod_s = 0.005'
     path = tmp_path / "elbow.toml"
     text = vsa_text(channel="can0", endpoint=zenohkit.free_endpoint(), bus=bus)

@@ -68,7 +68,7 @@ def asked(slave: RecordedSlave | lelykit.LelySlave) -> tuple[NodeLayout, list[st
 
 
 @pytest.mark.parametrize("maker", MAKERS)
-def test_what_lely_core_answered_is_configured_and_decoded(maker: str) -> None:
+def test_what_lely_core_answered_is_configured_and_decoded(maker):
     lines = transcript(maker)
     layout, log, counts = asked(RecordedSlave(lines))
     assert log == lines
@@ -78,7 +78,7 @@ def test_what_lely_core_answered_is_configured_and_decoded(maker: str) -> None:
 
 @pytest.mark.skipif(lelykit.library() is None, reason="no lely-core here")
 @pytest.mark.parametrize("sheet", sorted(SHEETS.glob("*.eds")), ids=lambda sheet: sheet.stem)
-def test_lely_core_is_configured_with_every_data_sheet_and_answers_as_recorded(sheet: Path) -> None:
+def test_lely_core_is_configured_with_every_data_sheet_and_answers_as_recorded(sheet):
     if "encoder" in sheet.name:
         pytest.skip("no drive")
     _, log, counts = asked(lelykit.LelySlave(NODE, sheet))

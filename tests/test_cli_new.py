@@ -1,5 +1,4 @@
 import io
-from pathlib import Path
 
 import can
 import pytest
@@ -143,7 +142,7 @@ def test_a_bus_without_a_drive_is_one_line_and_names_of_devices_cannot_break_the
     assert joint.motor[0].drive.node_id == 4
 
 
-def test_the_examples_are_copied_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_examples_are_copied_once(tmp_path, capsys):
     assert main(["new", "--examples", str(tmp_path)]) == 0
     assert (tmp_path / "examples" / "close_the_loop.py").exists()
     assert main(["new", "--examples", str(tmp_path)]) == 2

@@ -63,9 +63,7 @@ def simulation(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]
             process.kill()
 
 
-def test_two_processes_share_the_bus_over_tcp_and_sigterm_ends_cleanly(
-    file: Path, port: int, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_processes_share_the_bus_over_tcp_and_sigterm_ends_cleanly(file, port, capsys):
     with simulation(file) as (process, ready):
         assert ready == ("drivelink sim: ready on socketcand vcan0: wrist (drive 1, drive 2); Ctrl-C ends it")
         with can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=port) as bus:
@@ -87,9 +85,7 @@ def test_two_processes_share_the_bus_over_tcp_and_sigterm_ends_cleanly(
         assert process.stderr is not None and process.stderr.read() == ""
 
 
-def test_it_ends_by_itself_and_leaves_the_data_sheets(
-    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_ends_by_itself_and_leaves_the_data_sheets(file, tmp_path, capsys):
     before = signal.getsignal(signal.SIGTERM)
     arguments = [str(file), "--interface", "virtual", "--seconds", "0.1", "--write-eds", str(tmp_path)]
     assert main(["sim", *arguments]) == 0
@@ -98,7 +94,7 @@ def test_it_ends_by_itself_and_leaves_the_data_sheets(
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_other_simulations_join_the_first_as_clients(file: Path, tmp_path: Path) -> None:
+def test_other_simulations_join_the_first_as_clients(file, tmp_path):
     def others(name: str, tens: int) -> Path:
         path, text = tmp_path / f"{name}.toml", file.read_text(encoding="utf-8")
         path.write_text(text.replace("wrist", name).replace("node_id = ", f"node_id = {tens}"))

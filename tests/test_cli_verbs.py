@@ -26,13 +26,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 # `demo`, `run`, `monitor`, `record`, `fleet` and `doctor` need processes or a table: see the tests of each.
 @pytest.mark.parametrize("verb", ["fit", "replay", "diagnose"])
-def test_with_json_a_verb_prints_one_object_and_nothing_else(
-    verb: str,
-    fleet: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_with_json_a_verb_prints_one_object_and_nothing_else(verb, fleet, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     run, joint = fleet / "recordings" / "elbow-2026-01-05.csv", fleet / "joints" / "elbow.toml"
     assert main([verb, str(run), "--joint", str(joint), "--json"]) == 0
@@ -55,13 +49,7 @@ def test_with_json_a_verb_prints_one_object_and_nothing_else(
         ("new", ["other.toml", "--scan"]),
     ],
 )
-def test_every_verb_that_uses_a_bus_takes_it_by_option(
-    verb: str,
-    arguments: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_every_verb_that_uses_a_bus_takes_it_by_option(verb, arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["new", "elbow.toml", "--interface", "virtual"]) == 0
     capsys.readouterr()
@@ -77,6 +65,7 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(
         (["demo", "--seconds", "0"], 2, "argument --seconds: expected a number of seconds > 0, got 0"),
         (["run", "none.toml"], 2, "none.toml: cannot be read"),
         (["sim", "none.toml"], 2, "none.toml: cannot be read"),
+        (["monitor", "elbow", "--foxglove"], 2, "--foxglove: expected a joint file"),
         (["monitor", "--web", "--json"], 2, "expected either --web or --json"),
         (["record", "none.toml", "--out", "a.csv"], 2, "none.toml: cannot be read"),
         (["keep", "none.toml"], 2, "none.toml: cannot be read"),
@@ -121,9 +110,9 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )  # fmt: skip
 def test_what_a_verb_cannot_do_is_one_line(
-    arguments: list[str], status: int, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    arguments, status, line, tmp_path, monkeypatch,
+    capsys,
+):  # fmt: skip
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.toml").write_text("# mine\n")
     joint = NAMED + '[motor.drive]\nnode_id = 1\n[link.encoder]\n[sim]\ncase = "constant"\n[bus]\n{}\n'
@@ -148,9 +137,7 @@ def test_what_a_verb_cannot_do_is_one_line(
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)
-def test_an_unknown_option_prints_the_usage_of_its_own_verb(
-    verb: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_option_prints_the_usage_of_its_own_verb(verb, capsys):
     positional = {
         "run": ["a"], "sim": ["a"], "record": ["a", "--out", "b.csv"], "keep": ["a"], "replay": ["a"], "fit": ["a"],
             "accept": ["a"], "dbc": ["a"], "compare": ["a", "b"],
@@ -164,7 +151,7 @@ def test_an_unknown_option_prints_the_usage_of_its_own_verb(
     assert "unrecognized arguments: --no-such-option" in said
 
 
-def test_new_sim_and_service_print_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_new_sim_and_service_print_one_object(tmp_path, capsys):
     joint, stage = tmp_path / "elbow.toml", str(tmp_path / "stage")
 
     def said(*words: str) -> dict[str, Any]:
@@ -184,7 +171,7 @@ def test_new_sim_and_service_print_one_object(tmp_path: Path, capsys: pytest.Cap
     assert set(removed["removed"]) == set(installed["written"])
 
 
-def test_a_console_without_unicode_gets_the_words_spelt_out(fleet: Path) -> None:
+def test_a_console_without_unicode_gets_the_words_spelt_out(fleet):
     run, joint = fleet / "recordings" / "elbow-2026-01-05.csv", fleet / "joints" / "elbow.toml"
     command = [sys.executable, "-m", "drivelink", "fit", str(run), "--joint", str(joint)]
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}

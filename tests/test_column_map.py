@@ -35,7 +35,7 @@ MAP = [
 ]
 
 
-def motion(n: int = 8000) -> np.ndarray:
+def motion(n: int = 5000) -> np.ndarray:
     """(n, 4) time, motor position, torque, link position of a sprung joint: 150 N·m/rad, two tones."""
     t = np.arange(n) * 0.002
     rates = np.array([[3.0], [7.1]])
@@ -62,15 +62,25 @@ def theirs(path: Path, header: str = "t;theta [°];i;q;state") -> Path:
     return path
 
 
-def test_columns_of_others_are_read_in_our_names_and_units(tmp_path: Path) -> None:
+COLUMN_NAMES = ("motor_position_rad", "motor_torque_nm", "link_position_rad")
+
+
+def test_columns_of_others_are_read_in_our_names_and_units_also_in_place_of_ours(tmp_path):
     record = read(theirs(tmp_path / "rig.csv"), JOINT, names=parse_column_map(MAP))
     same = read(ours(tmp_path / "r.csv"), JOINT)
     assert record.period_s == same.period_s and np.array_equal(record.sequence, same.sequence)
-    for name in ("motor_position_rad", "motor_torque_nm", "link_position_rad"):
+    for name in COLUMN_NAMES:
         assert np.allclose(getattr(record, name), getattr(same, name), rtol=1e-14, atol=1e-15)
+    places = ("link_position_rad", "motor1_position_rad")
+    swapped = parse_column_map([f"{a}={b}" for a, b in (places, places[::-1])])
+    record = read(tmp_path / "r.csv", JOINT, names=swapped)
+    assert np.array_equal(record.motor_position_rad[:, 0], same.link_position_rad)
+    assert np.array_equal(record.link_position_rad, same.motor_position_rad[:, 0])
+    assert UNITS["_rad_s"]["rpm"] * 60 == UNITS["_rad"]["rev"] == 360 * UNITS["_rad"]["deg"] == 2 * math.pi
+    assert parse_column_map(["a=b=time_s:us"])["time_s"] == ("a=b", 1e-6, True)
 
 
-def test_channels_of_an_mf4_file_are_read_and_mapped_where_asammdf_is_installed(tmp_path: Path) -> None:
+def test_channels_of_an_mf4_file_are_read_and_mapped_where_asammdf_is_installed(tmp_path):
     record, path = read(ours(tmp_path / "r.csv"), JOINT), tmp_path / "r.mf4"
     if importlib.util.find_spec("asammdf") is None:
         path.touch()
@@ -90,7 +100,7 @@ def test_channels_of_an_mf4_file_are_read_and_mapped_where_asammdf_is_installed(
     assert np.allclose(turned.motor_position_rad[:, 0], np.radians(link), rtol=1e-14)
 
 
-def test_a_format_with_columns_is_one_entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_format_with_columns_is_one_entry(tmp_path, monkeypatch):
     entry = Format(columns=lambda path, _: (dict(np.load(path)), ()))
     monkeypatch.setitem(FORMATS, ".npz", entry)
     record, path = read(ours(tmp_path / "r.csv"), JOINT), tmp_path / "r.npz"
@@ -100,21 +110,6 @@ def test_a_format_with_columns_is_one_entry(tmp_path: Path, monkeypatch: pytest.
     assert np.array_equal(read(path, JOINT).motor_torque_nm, record.motor_torque_nm)
     find = pytest.importorskip("drivelink.fleet.storage").find
     assert [one.name for one in find([str(tmp_path)])[0]] == ["r.csv", "r.npz"]  # for `fleet`, too
-
-
-def test_a_column_that_is_mapped_takes_the_place_of_one_that_has_the_name(tmp_path: Path) -> None:
-    path = ours(tmp_path / "r.csv")
-    swapped = parse_column_map(
-        ["link_position_rad=motor1_position_rad", "motor1_position_rad=link_position_rad"]
-    )
-    record, same = read(path, JOINT, names=swapped), read(path, JOINT)
-    assert np.array_equal(record.motor_position_rad[:, 0], same.link_position_rad)
-    assert np.array_equal(record.link_position_rad, same.motor_position_rad[:, 0])
-
-
-def test_units_are_those_of_physics() -> None:
-    assert UNITS["_rad_s"]["rpm"] * 60 == UNITS["_rad"]["rev"] == 360 * UNITS["_rad"]["deg"] == 2 * math.pi
-    assert parse_column_map(["a=b=time_s:us"])["time_s"] == ("a=b", 1e-6, True)
 
 
 @pytest.mark.parametrize(
@@ -128,13 +123,13 @@ def test_units_are_those_of_physics() -> None:
         ("q=link_position_rad:inf", "or a factor"),
     ],
 )
-def test_a_mapping_that_cannot_be_is_one_line(text: str, line: str) -> None:
+def test_a_mapping_that_cannot_be_is_one_line(text, line):
     with pytest.raises(UsageError) as caught:
         parse_column_map([text])
     assert line in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_what_a_mapping_asks_for_in_vain_is_one_line(tmp_path: Path) -> None:
+def test_what_a_mapping_asks_for_in_vain_is_one_line(tmp_path):
     names = parse_column_map([*MAP[:3], "angle=link_position_rad"])
     with pytest.raises(RecordingError, match="--map angle=link_position_rad: no such column 'angle', found"):
         read(theirs(tmp_path / "rig.csv"), JOINT, names=names)
@@ -154,17 +149,14 @@ link_position_rad = { name = "q", unit = "mrad" }
 """
 
 
-def test_the_joint_file_names_columns_once(tmp_path: Path) -> None:
-    joint, path = parse(TEXT + COLUMNS), theirs(tmp_path / "rig.csv")
+def test_the_joint_file_names_columns_once(tmp_path):
+    joint, path, own = parse(TEXT + COLUMNS), theirs(tmp_path / "rig.csv"), ours(tmp_path / "r.csv")
     record, same = read(path, joint), read(path, JOINT, names=parse_column_map(MAP))
-    for name in ("motor_position_rad", "motor_torque_nm", "link_position_rad"):
+    for name in COLUMN_NAMES:
         assert np.array_equal(getattr(record, name), getattr(same, name))
-    assert np.array_equal(  # a file with our own names is read as it is
-        read(ours(tmp_path / "r.csv"), joint).motor_torque_nm, read(tmp_path / "r.csv", JOINT).motor_torque_nm
-    )
-    swapped = read(
-        path, joint, names=parse_column_map(["q=link_position_rad:rad"])
-    )  # --map has the last word
+    # A file with our own names is read as it is, and --map has the last word.
+    assert np.array_equal(read(own, joint).motor_torque_nm, read(own, JOINT).motor_torque_nm)
+    swapped = read(path, joint, names=parse_column_map(["q=link_position_rad:rad"]))
     assert np.allclose(swapped.link_position_rad, 1e3 * same.link_position_rad, rtol=1e-14, atol=0.0)
     with pytest.raises(RecordingError, match=r"recording.columns.link_position_rad: no such column 'q'"):
         read(theirs(tmp_path / "x.csv", "t;theta [°];i;angle;state"), joint)
@@ -179,37 +171,27 @@ def test_the_joint_file_names_columns_once(tmp_path: Path) -> None:
         ("time_s = { unit = 's' }", "recording.columns.time_s.name: expected this key, it is missing"),
     ],
 )
-def test_a_column_of_the_joint_file_that_cannot_be_is_one_line(line: str, said: str) -> None:
+def test_a_column_of_the_joint_file_that_cannot_be_is_one_line(line, said):
     with pytest.raises(JointFileError) as caught:
         parse(f"{TEXT}[recording.columns]\n{line}\n")
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("declared", [False, True])
-@pytest.mark.parametrize("verb", ["replay", "fit", "diagnose"])
-def test_every_verb_that_reads_takes_the_mapping(
-    verb: str, declared: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize(
+    ("verb", "declared"), [("replay", False), ("replay", True), ("fit", False), ("diagnose", True)]
+)
+def test_every_verb_that_reads_takes_the_mapping_and_needs_a_joint(verb, declared, tmp_path, capsys):
     joint = tmp_path / "sine.toml"
     joint.write_text(TEXT + (COLUMNS if declared else ""))
     options = [] if declared else [word for text in MAP for word in ("--map", text)]
     out = ["--out", str(tmp_path / "out")] if verb == "diagnose" else []
-    command = [verb, str(theirs(tmp_path / "rig.csv")), "--joint", str(joint), *options, *out]
-    assert cli.main(command) == 0, capsys.readouterr().err
+    recording = str(theirs(tmp_path / "rig.csv"))
+    assert cli.main([verb, recording, "--joint", str(joint), *options, *out]) == 0, capsys.readouterr().err
+    assert cli.main([verb, recording]) == 2  # it carries none
+    assert "--joint: expected the joint file that" in capsys.readouterr().err
 
 
-# --json, and the joint that a recording carries
-
-
-def only_json(capsys: pytest.CaptureFixture[str]) -> dict:
-    out = capsys.readouterr().out
-    assert out.count("\n") == 1
-    return json.loads(out)
-
-
-def test_fit_takes_the_joint_from_a_recording_that_carries_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fit_takes_the_joint_from_a_recording_that_carries_it(tmp_path, capsys):
     bus = "[bus]\nperiod_s = 0.002\n"
     path, target = tmp_path / "r.mcap", tmp_path / "fitted.toml"
     joint = parse(TEXT + bus)
@@ -218,32 +200,10 @@ def test_fit_takes_the_joint_from_a_recording_that_carries_it(
         sink.sample(sample, sample.sequence * 2_000_000)
     sink.close()
     assert cli.main(["fit", str(path), "--json", "--out", str(tmp_path / "d"), "--write", str(target)]) == 0
-    document = only_json(capsys)
+    document = json.loads(capsys.readouterr().out)
     assert document == json.loads((tmp_path / "d" / "fit.json").read_text())
     (one,) = document["transmissions"]
     assert one["parameters"]["k_nm_rad"] == pytest.approx(150.0, rel=1e-3)  # noise-free
     assert 'remark = "kept"' in target.read_text() and "k_nm_rad" in target.read_text()
     assert cli.main(["diagnose", str(path), "--out", str(tmp_path / "d")]) == 0
     assert json.loads((tmp_path / "d" / "report.json").read_text())["verdict"] == "sufficient"
-
-
-def test_replay_prints_one_json_object_and_nothing_else(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    joint, out = tmp_path / "sine.toml", tmp_path / "e.csv"
-    joint.write_text(TEXT)
-    arguments = ["replay", str(ours(tmp_path / "r.csv")), "--joint", str(joint), "--out", str(out), "--json"]
-    assert cli.main(arguments) == 0
-    document = only_json(capsys)
-    assert document["cycles"] == 8000 and document["estimates"] == str(out)
-    assert document["end"]["stiffness_nm_rad"] == pytest.approx(150.0, rel=0.01)
-    assert document["seconds"] == pytest.approx(15.998)
-
-
-def test_without_a_joint_a_recording_that_carries_none_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = ours(tmp_path / "r.csv")
-    for verb in ("fit", "diagnose", "replay"):
-        assert cli.main([verb, str(path)]) == 2
-        assert "--joint: expected the joint file that" in capsys.readouterr().err

@@ -27,14 +27,14 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, (effects, parameters) in kinds.items():
         world = world_from_joint(jointfile.load(ELBOW))
         alter(world, effects, parameters)
-        columns = record(world, 8.0)
+        columns = record(world, 5.0)
         rows = np.column_stack([columns[column] for column in COLUMNS])
         np.savetxt(folder / f"{name}.csv", rows, "%.17g", ",", header=",".join(COLUMNS), comments="")
     return folder
 
 
-def test_two_machines_differ_in_the_stiffness_and_each_model_fits_its_own(runs: Path) -> None:
-    made = compare(runs / "healthy.csv", runs / "soft.csv", ELBOW)
+def test_two_machines_differ_in_the_stiffness_and_each_model_fits_its_own(runs):
+    made = compare(runs / "healthy.csv", runs / "soft.csv", ELBOW, horizon_s=2.0)
     stiffness, friction = made.differences()
     assert abs(stiffness.b / stiffness.a - 0.9) < 0.02
     assert abs(stiffness.b - stiffness.a) > 10.0 * stiffness.std > 0.0
@@ -47,15 +47,15 @@ def test_two_machines_differ_in_the_stiffness_and_each_model_fits_its_own(runs: 
         assert most[1 - own] > 1.5 * most[own]  # what the wrong spring leaves goes with the torque
 
 
-def test_friction_that_nobody_declared_is_in_the_curve_and_in_the_free_run(runs: Path) -> None:
-    made = compare(ELBOW, runs / "friction.csv")
+def test_friction_that_nobody_declared_is_in_the_curve_and_in_the_free_run(runs):
+    made = compare(ELBOW, runs / "friction.csv", horizon_s=2.0)
     friction = made.differences()[1]
     assert abs(abs(friction.b - friction.a) - 0.6) < 0.1
     (_, declared, fitted) = made.runs[0]
     assert min(fitted.fit_percent.values()) > 99.0 > 90.0 > max(declared.fit_percent.values())
 
 
-def test_the_verb_writes_a_page_and_numbers(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_writes_a_page_and_numbers(runs, capsys):
     healthy = str(runs / "healthy.csv")
     assert cli.main(["compare", str(ELBOW), healthy, "--horizon", "1", "--out", str(runs / "page")]) == 0
     assert "fit of A" in capsys.readouterr().out

@@ -20,7 +20,7 @@ def complete(script: Path, words: list[str]) -> set[str]:
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
-def test_bash_completes_verbs_options_and_choices(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bash_completes_verbs_options_and_choices(tmp_path, capsys):
     assert cli.main(["completion", "bash"]) == 0
     script = tmp_path / "drivelink.bash"
     script.write_text(capsys.readouterr().out)
@@ -29,7 +29,7 @@ def test_bash_completes_verbs_options_and_choices(tmp_path: Path, capsys: pytest
     assert complete(script, ["drivelink", "demo", "--case", ""]) >= {"constant", "quadratic", "vsa-ii"}
 
 
-def test_zsh_has_its_script_and_the_manual_page_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
+def test_zsh_has_its_script_and_the_manual_page_every_verb(capsys):
     assert cli.main(["completion", "zsh"]) == 0
     assert "replay" in capsys.readouterr().out
     page = (Path(__file__).parent.parent / "packaging" / "drivelink.1").read_text(encoding="utf-8")

@@ -105,20 +105,16 @@ def test_a_drive_is_set_up_enabled_and_commanded_and_only_by_the_controllers_own
         assert not any(cob in (0x000, 0x080) for cob, _ in b.sent)  # no NMT, no SYNC
 
 
-def test_mapping_that_is_there_already_is_not_written():
+def test_mapping_that_is_there_already_is_not_written_and_before_the_set_up_there_is_the_heartbeat_only():
     with bench() as b:
+        b.master.command((0.1,), 0.0)
+        assert [cob for cob, _ in b.sent] == [0x77E]
         b.run(100)
         b.sent.clear()
         b.master = b.made()
         b.run(100)
         assert b.master.states["enabled"]
         assert not b.written() & {0x1402, 0x1602}
-
-
-def test_nothing_but_the_heartbeat_before_a_drive_is_set_up():
-    with bench() as b:
-        b.master.command((0.1,), 0.0)
-        assert [cob for cob, _ in b.sent] == [0x77E]
 
 
 def test_a_fault_ends_the_torque_and_is_reset_by_edges_and_not_for_ever():

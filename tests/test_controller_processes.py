@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import controllerkit as kit
 import pytest
@@ -26,7 +25,7 @@ def reaches(events: list[dict], phase: str, after: int = 0) -> dict:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_killed_daemon_and_the_way_back_in_three_processes(tmp_path: Path) -> None:
+def test_a_killed_daemon_and_the_way_back_in_three_processes(tmp_path):
     head, _, rest = kit.declared_text().partition("[bus]")
     options = f'options = {{ host = "127.0.0.1", port = {free_port()}, tcp_tune = true }}\nperiod_s = 0.002'
     bus = f'[bus]\ninterface = "socketcand"\nchannel = "vsa"\n{options}\n[zenoh]\nendpoint = "{free_endpoint()}"\n'

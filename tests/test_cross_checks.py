@@ -54,25 +54,20 @@ FAULTS = {
     "the velocity is stuck": (lambda s: s._replace(velocity_rad_s=3.0), "motor_position_or_velocity"),
     "the current is stuck": (lambda s: s._replace(current_a=0.1), "motor_torque_or_current"),
     "the encoder lies by a fifth": (
-        lambda s: s._replace(position_counts=round(1.2 * s.position_counts)),
-        "motor_position_or_velocity",
+        lambda s: s._replace(position_counts=round(1.2 * s.position_counts)), "motor_position_or_velocity",
     ),
     "the torque's scale changes, the current's stays": (
-        lambda s: s._replace(torque_nm=1.15 * s.torque_nm),
-        "motor_torque_or_current",
+        lambda s: s._replace(torque_nm=1.15 * s.torque_nm), "motor_torque_or_current",
     ),
-    "the position is stuck": (
-        lambda s: s._replace(position_counts=1234),
-        "motor_position_or_velocity",
-    ),
-}
+    "the position is stuck": (lambda s: s._replace(position_counts=1234), "motor_position_or_velocity"),
+}  # fmt: skip
 
 
 UNUSED = ("the velocity is stuck", "the current is stuck")  # by the estimate
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_lie_is_found_named_and_nothing_valid_said_until_it_is_over(calibrated, name) -> None:
+def test_a_lie_is_found_named_and_nothing_valid_said_until_it_is_over(calibrated, name):
     spoil, signal = FAULTS[name]
     before = calibrated.run(200)
     assert not any(e.status & Status.CONTRADICTED for e in before)
@@ -94,7 +89,7 @@ def test_a_lie_is_found_named_and_nothing_valid_said_until_it_is_over(calibrated
 
 
 @pytest.mark.slow
-def test_healthy_motion_contradicts_nothing() -> None:
+def test_healthy_motion_contradicts_nothing():
     """Two motors with two checks each: 3200 blocks, where one in 10⁹ windows is declared."""
     with rig(joint()) as made:
         for _ in range(4):
@@ -104,33 +99,30 @@ def test_healthy_motion_contradicts_nothing() -> None:
             assert abs(check["scale"] - 1.0) < 0.01 + 3 * check["std"], check
 
 
-def test_what_is_not_asked_for_is_not_mapped_and_costs_no_frame() -> None:
+def test_what_is_not_asked_for_is_not_mapped_and_what_does_not_come_costs_no_sample():
     with rig(vsa()) as made:
         made.run(100)
         assert made.status["cross_checks"] == []
         assert [len(made.daemon.layouts[node].tpdos) for node in (1, 2)] == [1, 1]
-
-
-def test_a_check_that_does_not_come_costs_no_sample() -> None:
     with rig(joint()) as made:
         made.run(100)
         layout = made.daemon.layouts[1]
         (number,) = [t.number for t in layout.tpdos if Signal.VELOCITY_CHECK in {o.signal for o in t.objects}]
-        made.faults.mute(made.node(1), number, 1000)
+        made.faults.mute(made.node(1), number, 500)
         missed = made.loop_joint.pipeline.missed
-        made.run(1000)
+        made.run(500)
         assert made.loop_joint.pipeline.missed == missed
 
 
 # --- frames alone: what the simulated drives do not have ---------------------------------------------------------------
 
 
-def layout(*extra: tuple[Signal, int, float]) -> NodeLayout:
-    """A drive with further objects of 32 bits in a second TPDO."""
+def listening(*extra: tuple[Signal, int, float]) -> Assembler:
+    """To a drive with further objects of 32 bits in a second TPDO."""
     absolute = (Signal.SECOND_POSITION, Signal.POSITION_DEMAND)
     objects = tuple(mapped(s, index, scale=scale, wraps=s in absolute) for s, index, scale in extra)
     further = TpdoLayout(cob_id=0x281, objects=objects)
-    return NodeLayout(node_id=1, motor=0, tpdos=(*drive(1, 0).tpdos, further))
+    return Assembler((NodeLayout(node_id=1, motor=0, tpdos=(*drive(1, 0).tpdos, further)),), 1)
 
 
 def feed(
@@ -151,20 +143,18 @@ def motion(t: float) -> float:
     return 8000 * math.sin(5 * t) + 1500 * math.sin(17 * t)
 
 
-def test_a_second_encoder_decides_which_of_position_and_velocity_is_wrong() -> None:
+def test_a_second_encoder_decides_which_of_position_and_velocity_is_wrong():
     """Velocity and second encoder both check the position: the velocity alone is wrong, and the estimate stays."""
 
     def truth(t: float, velocity: float = 1.0, position: float = 1.0) -> tuple[float, tuple[int, ...]]:
         speed = COUNT_RAD * (40_000 * math.cos(5 * t) + 25_500 * math.cos(17 * t))
         return position * motion(t), (round(-1.7 * motion(t)) + 500, round(velocity * speed / 1e-3))
 
-    assembler = Assembler(
-        (layout((Signal.SECOND_POSITION, 0x60E4, COUNT_RAD), (Signal.VELOCITY_CHECK, 0x606C, 1e-3)),), 1
-    )
+    assembler = listening((Signal.SECOND_POSITION, 0x60E4, COUNT_RAD), (Signal.VELOCITY_CHECK, 0x606C, 1e-3))
     feed(assembler, 0, 10_000, truth)
-    assert {check[1]: check[2] for check in assembler.checks} == {
-        "velocity": "agrees",
-        "second_encoder": "agrees",
+    assert {check[1:3] for check in assembler.checks} == {
+        ("velocity", "agrees"),
+        ("second_encoder", "agrees"),
     }
     assert assembler.checks[1][3] == pytest.approx(-1.7, abs=0.01)
     flags = feed(assembler, 10_000, 2000, lambda t: truth(t, velocity=0.5))
@@ -176,27 +166,27 @@ def test_a_second_encoder_decides_which_of_position_and_velocity_is_wrong() -> N
     assert {check[2] for check in assembler.checks} == {"contradicts"}
 
 
-def test_a_following_error_that_is_not_demand_less_position_is_found() -> None:
+def test_a_following_error_that_is_not_demand_less_position_is_found():
     def truth(t: float, factor: float = 1.0) -> tuple[float, tuple[int, ...]]:
         error = 800 * math.sin(11 * t)
         return motion(t), (round(motion(t) + error), round(factor * error))
 
-    assembler = Assembler(
-        (layout((Signal.POSITION_DEMAND, 0x6062, COUNT_RAD), (Signal.FOLLOWING_ERROR, 0x60F4, COUNT_RAD)),), 1
+    assembler = listening(
+        (Signal.POSITION_DEMAND, 0x6062, COUNT_RAD), (Signal.FOLLOWING_ERROR, 0x60F4, COUNT_RAD)
     )
     assert not any(f & Status.CONTRADICTED for f in feed(assembler, 0, 20_000, truth))
     assert [check[1:3] for check in assembler.checks] == [("following_error", "agrees")]
     assert feed(assembler, 20_000, 1000, lambda t: truth(t, 0.0))[-1] & Status.CONTRADICTED
 
 
-def test_a_velocity_of_another_unit_is_found_from_the_start() -> None:
+def test_a_velocity_of_another_unit_is_found_from_the_start():
     """A counts_per_rev that is four times too small, say: velocity is in rpm, whatever the encoder is."""
 
     def readings(t: float) -> tuple[float, tuple[int, ...]]:
         speed = 4 * COUNT_RAD * (40_000 * math.cos(5 * t) + 25_500 * math.cos(17 * t))
         return motion(t), (round(speed / 1e-3),)
 
-    assembler = Assembler((layout((Signal.VELOCITY_CHECK, 0x606C, 1e-3)),), 1)
+    assembler = listening((Signal.VELOCITY_CHECK, 0x606C, 1e-3))
     assert feed(assembler, 0, 10_000, readings)[-1] & Status.CONTRADICTED
     ((_, _, _, scale, std),) = assembler.checks
     assert scale == pytest.approx(4.0, abs=0.05)
@@ -223,18 +213,16 @@ def awkward_motion(rng: np.random.Generator, samples: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("lag_s", "step_rad_s", "noise_nm"), [(0.004, 0.002, 0.02), (0.02, 0.01, 0.2), (0.005, 0.1, 0.5)]
 )
-def test_lag_coarse_steps_noise_rests_and_impacts_contradict_nothing(lag_s, step_rad_s, noise_nm) -> None:
-    """A velocity that is filtered and cut off, a current with noise of its own and another ratio; 200 s."""
-    rng, samples = np.random.default_rng(round(1e4 * lag_s)), 200_000
+def test_lag_coarse_steps_noise_rests_and_impacts_contradict_nothing(lag_s, step_rad_s, noise_nm):
+    """A velocity that is filtered and cut off, a current with noise of its own and another ratio; 100 s."""
+    rng, samples = np.random.default_rng(round(1e4 * lag_s)), 100_000
     velocity = awkward_motion(rng, samples)
     position = np.cumsum(velocity) * 1e-3
     keep = math.exp(-1e-3 / lag_s)
     filtered = lfilter([1.0 - keep], [1.0, -keep], velocity)
     torque = np.clip(20.0 * np.gradient(velocity) + 0.3 * np.sign(velocity) + 0.5 * velocity, -25.0, 25.0)
     current = 1.7 * torque + noise_nm * rng.normal(size=samples)
-    assembler = Assembler(
-        (layout((Signal.VELOCITY_CHECK, 0x606C, step_rad_s), (Signal.TORQUE_CHECK, 0x6078, 1e-3)),), 1
-    )
+    assembler = listening((Signal.VELOCITY_CHECK, 0x606C, step_rad_s), (Signal.TORQUE_CHECK, 0x6078, 1e-3))
     for p, v, i, c in zip(
         np.rint(position / COUNT_RAD).astype(int).tolist(),
         np.trunc(filtered / step_rad_s).astype(int).tolist(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from pathlib import Path
 
 import pytest
 from canopenkit import INVALID
@@ -95,8 +94,9 @@ def read_scales(master: Master) -> None:
         master.read(3, index)
 
 
-def map_all(master: Master) -> None:
-    """A configuration that a passive listener hears from its first frame on."""
+def mapped(syncs: int = 50) -> Master:
+    """Beside a passive listener that hears its configuration from the first frame on."""
+    master = Master()
     read_scales(master)
     for node, entries in ((1, (POSITION, TORQUE, STATUSWORD)), (3, (0x60040020,))):
         master.nmt(PRE, node)
@@ -106,14 +106,12 @@ def map_all(master: Master) -> None:
     master.disable_others()
     master.map(2, 1, POSITION, TORQUE, STATUSWORD)
     master.nmt(START, 2)
+    master.syncs(syncs)
+    return master
 
 
-def test_an_sdo_answer_that_nobody_asked_for_changes_nothing_and_one_beside_the_nodes_own_ends_validity() -> (
-    None
-):
-    master = Master()
-    map_all(master)
-    master.syncs(50)
+def test_an_sdo_answer_unasked_changes_nothing_and_one_beside_the_nodes_own_ends_validity():
+    master = mapped()
     layout, valid = master.run.configurator.layouts[1], len(master.valid)
     lie = b"\x43\x76\x60\x00" + (7 * 800).to_bytes(4, "little")  # rated torque
     master.send(0x581, lie)
@@ -134,7 +132,7 @@ def test_an_sdo_answer_that_nobody_asked_for_changes_nothing_and_one_beside_the_
 
 @pytest.mark.parametrize("syncs", [0, 1, 3])
 @pytest.mark.parametrize("stopped_by", [PRE, STOP], ids=["pre-operational", "stopped"])
-def test_a_map_that_changes_holds_from_its_sync_on(syncs: int, stopped_by: int) -> None:
+def test_a_map_that_changes_holds_from_its_sync_on(syncs, stopped_by):
     master = Master()
     read_scales(master)
     master.syncs(50)
@@ -158,8 +156,8 @@ def test_a_map_that_changes_holds_from_its_sync_on(syncs: int, stopped_by: int) 
 @pytest.mark.parametrize("reset", [RESET_NODE, RESET_COMMUNICATION])
 @pytest.mark.parametrize("everybody", [False, True], ids=["one", "all"])
 def test_after_a_reset_without_a_new_map_nothing_is_valid_and_one_line_says_what_would_settle_it(
-    reset: int, everybody: bool
-) -> None:
+    reset, everybody
+):
     master = Master()
     master.syncs(50)
     master.nmt(reset, 0 if everybody else 1)  # its default map has identifier and length of ours, and starts
@@ -167,29 +165,37 @@ def test_after_a_reset_without_a_new_map_nothing_is_valid_and_one_line_says_what
     master.syncs(1500)
     assert len(master.valid) == 50
     assert master.wrong == []
-    assert (
-        "node 1 (motor[1].drive): it has restarted, and its mapping was neither written nor read since"
-        in (master.conditions)
-    )
+    said = "node 1 (motor[1].drive): it has restarted, and its mapping was neither written nor read since"
+    assert said in master.conditions
     assert "[[motor.drive.tpdo]] with default = true" in master.conditions
 
 
-def test_a_block_download_to_the_mapping_ends_validity() -> None:
-    master = Master()
-    map_all(master)
-    master.syncs(50)
+def overflow(master: Master) -> None:
+    master.run.loop.source.errors[OVERFLOW] = 3
+    master.run.supervisor.check()
+
+
+ENDS = {
+    "block": (lambda m: m.send(0x601, b"\xc2\x00\x1a\x01" + (4).to_bytes(4, "little")), "0x1A00:01"),
+    "overflow": (overflow, "frames were lost by receive overflow"),
+    "boot-up": (lambda m: m.run.bus.nodes[0].reset() or m.send(0x701, b"\x00"), "it has restarted"),
+}
+
+
+@pytest.mark.parametrize("event", ENDS)
+def test_a_block_download_to_the_mapping_lost_frames_and_a_boot_up_end_validity(event):
+    happens, said = ENDS[event]
+    master = mapped()
     valid = len(master.valid)
     assert valid
-    master.send(0x601, b"\xc2\x00\x1a\x01" + (4).to_bytes(4, "little"))
-    master.syncs(50)
+    happens(master)
+    master.syncs(100)
     assert len(master.valid) == valid
-    assert "0x1A00:01" in master.conditions
+    assert said in master.conditions
 
 
-def test_a_node_that_was_not_heard_for_a_while_may_have_restarted() -> None:
-    master = Master()
-    map_all(master)
-    master.syncs(50)
+def test_a_node_that_was_not_heard_for_a_while_may_have_restarted():
+    master = mapped()
     assert master.valid
     bus = master.run.bus
     for _ in range(700):
@@ -208,28 +214,7 @@ def test_a_node_that_was_not_heard_for_a_while_may_have_restarted() -> None:
     assert len(master.valid) > valid + 100 and not master.wrong
 
 
-def test_frames_lost_by_receive_overflow_end_validity() -> None:
-    master = Master()
-    map_all(master)
-    master.syncs(50)
-    valid = len(master.valid)
-    master.run.loop.source.errors[OVERFLOW] = 3
-    master.run.supervisor.check()
-    master.syncs(50)
-    assert len(master.valid) == valid
-    assert "frames were lost by receive overflow" in master.conditions
-
-
-def test_a_boot_up_message_that_nobody_expected_is_enough() -> None:
-    master = Master()
-    master.syncs(50)
-    master.run.bus.nodes[0].reset()
-    master.send(0x701, b"\x00")
-    master.syncs(100)
-    assert len(master.valid) == 50
-
-
-def test_after_a_reset_a_map_that_is_read_back_is_believed() -> None:
+def test_after_a_reset_a_map_that_is_read_back_is_believed():
     master = Master()
     read_scales(master)
     master.syncs(50)
@@ -259,7 +244,7 @@ def test_after_a_reset_a_map_that_is_read_back_is_believed() -> None:
     assert "mapping" not in master.conditions
 
 
-def test_a_map_rewritten_while_the_node_sends_is_never_half_believed() -> None:
+def test_a_map_rewritten_while_the_node_sends_is_never_half_believed():
     master = Master()
     master.syncs(20)
     slave = master.run.bus.nodes[1].slave
@@ -277,9 +262,8 @@ def test_a_map_rewritten_while_the_node_sends_is_never_half_believed() -> None:
     assert master.wrong == []
 
 
-def test_a_log_gives_the_samples_of_the_live_run(tmp_path: Path) -> None:
-    master = Master()
-    map_all(master)
+def test_a_log_gives_the_samples_of_the_live_run(tmp_path):
+    master = mapped(0)
     begun = len(master.valid)
     master.syncs(100)
     master.nmt(PRE, 2)
@@ -295,21 +279,17 @@ def test_a_log_gives_the_samples_of_the_live_run(tmp_path: Path) -> None:
     master.syncs(600)
     assert master.wrong == []
     path = tmp_path / "passive.log"
-    path.write_text(
-        "".join(
-            f"({stamp_ns // 10**9}.{stamp_ns % 10**9 // 1000:06d}) vcan0 {cob_id:03X}#{data.hex().upper()}\n"
-            for stamp_ns, cob_id, data in master.log
-        )
+    lines = (
+        f"({stamp_ns / 1e9:.6f}) vcan0 {cob_id:03X}#{data.hex()}\n" for stamp_ns, cob_id, data in master.log
     )
+    path.write_text("".join(lines))
     log = FrameLog(path, master.run.joint, tmp_path)
     replayed = [master.run.ticks_of(cycle.sample) for cycle in log.cycles() if cycle.sample is not None]
     assert replayed == [ticks for _, ticks in master.valid[begun:]]
     assert len(replayed) > 700
 
 
-def test_a_node_without_heartbeat_after_its_reset_is_operational_when_it_sends(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_node_without_heartbeat_after_its_reset_is_operational_when_it_sends(monkeypatch):
     master = Master()
     run = master.run
     monkeypatch.setattr(run.loop, "clock", lambda: master.stamp_ns)

@@ -45,25 +45,23 @@ def joined(period_s: float, bus: str):
     return configurator.bus.period_s
 
 
-@pytest.mark.parametrize("period_s", [0.00102, 0.00125, 0.002, 0.003, 0.01])
-def test_a_period_that_is_left_out_is_that_of_the_master(
-    period_s: float, caplog: pytest.LogCaptureFixture
-) -> None:
+WRONG = (
+    "SYNC comes every 2 ms, the joint file says 1 ms: 2 ms is used; set bus.period_s = 0.002, or leave it out"
+)
+
+
+@pytest.mark.parametrize(
+    ("period_s", "stated", "used", "said"),
+    [
+        *((s, "", s, f"SYNC comes every {s * 1e3:.4g} ms") for s in (0.00102, 0.00125, 0.002, 0.003, 0.01)),
+        (0.002, "period_s = 0.001", 0.002, WRONG),
+        (0.001001, "period_s = 0.001", 0.001, ""),
+    ],
+)
+def test_the_master_s_period_is_used_and_one_that_is_stated_wrong_is_said_with_both_and_with_the_fix(
+    period_s, stated, used, said, caplog
+):
     with caplog.at_level(logging.INFO, "drivelink"):
-        assert joined(period_s, "") == period_s
-    assert f"SYNC comes every {period_s * 1e3:.4g} ms" in caplog.text
-    assert not any(record.levelno >= logging.WARNING for record in caplog.records)
-
-
-def test_a_period_that_is_stated_wrong_is_said_with_both_and_with_the_fix(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    assert joined(0.002, "period_s = 0.001") == 0.002
-    assert (
-        "SYNC comes every 2 ms, the joint file says 1 ms: 2 ms is used; set bus.period_s = 0.002, or leave it out"
-    ) in caplog.text
-
-
-def test_a_period_that_is_right_is_not_mentioned(caplog: pytest.LogCaptureFixture) -> None:
-    assert joined(0.001001, "period_s = 0.001") == 0.001
-    assert "SYNC comes" not in caplog.text
+        assert joined(period_s, stated) == used
+    assert said in caplog.text and ("SYNC comes" in caplog.text) == bool(said)
+    assert any(record.levelno >= logging.WARNING for record in caplog.records) == (said == WRONG)

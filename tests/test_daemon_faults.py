@@ -20,9 +20,13 @@ def settle(made: DaemonRig) -> None:
     assert made.status["state"] == "running"
 
 
-def test_every_cycle_has_an_estimate_in_order_and_nothing_is_missed() -> None:
-    with rig() as made:
+def test_every_cycle_has_an_estimate_in_order_and_a_counter_on_sync_is_made_where_it_is_asked_for():
+    with rig(vsa(bus="sync_counter_overflow = 10")) as made:
+        seen: list[bytes] = []
+        inner = made.network.sync_filter
+        made.network.sync_filter = lambda data: (seen.append(data), inner(data))[1]
         estimates = made.run(500)
+        assert [data[0] for data in seen] == [k % 10 + 1 for k in range(500)]
         assert [estimate.sequence for estimate in estimates] == list(range(500))
         stamps = [stamp for _, stamp in made.collector.estimates]
         assert {b - a for a, b in pairwise(stamps)} == {1_000_000}
@@ -32,28 +36,23 @@ def test_every_cycle_has_an_estimate_in_order_and_nothing_is_missed() -> None:
         assert made.events == []
 
 
-def test_an_emcy_is_a_drive_fault_in_words_and_said_once() -> None:
+def test_an_emcy_and_cycles_lost_by_a_slow_machine_are_said_in_words_once():
     with rig() as made:
         made.run(50)
+        made.daemon.loop.overruns += 3  # as the pacing counts them
+        made.run(100)
+        slow = "this machine is too slow for the cycle of 1 ms: cycles left out so far: 3; drivelink doctor names the cause"
+        assert slow in made.events
+        made.run(2000)
+        assert "this machine keeps up with the cycle again; cycles left out: 3" in made.events
         made.faults.emergency(made.node(1), 0x2310, 0x02)
-        estimates = made.run(200)
-        assert all(e.status & Status.DRIVE_FAULT for e in estimates)
+        assert all(e.status & Status.DRIVE_FAULT for e in made.run(200))
         assert made.status["drive_faults"] == ["node 1: EMCY 0x2310 (continuous overcurrent)"]
         assert made.status["nodes"]["1"]["drive_state"] == "fault"
-        said = [text for text in made.events if "0x2310" in text]
-        assert len(said) == 1
+        assert len([text for text in made.events if "0x2310" in text]) == 1
 
 
-def test_a_counter_on_sync_is_made_where_it_is_asked_for() -> None:
-    with rig(vsa(bus="sync_counter_overflow = 10")) as made:
-        seen: list[bytes] = []
-        inner = made.network.sync_filter
-        made.network.sync_filter = lambda data: (seen.append(data), inner(data))[1]
-        assert len(made.run(25)) == 25
-        assert [data[0] for data in seen] == [k % 10 + 1 for k in range(25)]
-
-
-def test_a_drive_that_takes_the_start_and_does_not_run_is_said_once() -> None:
+def test_a_drive_that_takes_the_start_and_does_not_run_is_said_once():
     with rig() as made:
         settle(made)
         node = made.node(2)
@@ -72,7 +71,7 @@ def test_a_drive_that_takes_the_start_and_does_not_run_is_said_once() -> None:
 
 
 @pytest.mark.parametrize("able", [True, False])
-def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(able: bool) -> None:
+def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(able):
     """As one in whose place another device with its number was configured."""
     with rig() as made:
         settle(made)
@@ -88,7 +87,9 @@ def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(able
         assert made.run(1)[0].status & Status.VALID
 
 
-def test_a_second_reboot_in_the_middle_of_the_configuration_begins_it_anew() -> None:
+def test_a_second_reboot_begins_the_configuration_anew_and_what_goes_wrong_in_it_is_that_nodes_own(
+    monkeypatch,
+):
     with rig() as made:
         settle(made)
         made.run(2000)  # enough is learned to hold blocks after a reboot against
@@ -99,6 +100,17 @@ def test_a_second_reboot_in_the_middle_of_the_configuration_begins_it_anew() -> 
             made.faults.reboot(made.node(2))
         assert valid(made.run(ENOUGH))[-1]
         assert made.status["nodes"]["2"]["reboots"] == 4
+
+        def broken(*_: object, **__: object) -> None:
+            raise OverflowError("int too large to convert to float")
+
+        monkeypatch.setattr("drivelink.canopen.node.offer", broken)
+        made.faults.reboot(made.node(1))
+        assert len(made.run(1500)) >= 1499  # a cycle that lacks a frame is concluded with the next SYNC
+        said = "node 1 cannot be configured: node 1: OverflowError in its configuration: int too large"
+        assert said in " ".join(made.events)
+        monkeypatch.undo()
+        assert any(valid(made.run(ENOUGH + 3000)))  # and until motion has shown its zero
 
 
 def bunches(made: DaemonRig, listener: Listener, count: int) -> list[str]:
@@ -114,7 +126,7 @@ def bunches(made: DaemonRig, listener: Listener, count: int) -> list[str]:
     return [event for event in made.events if "used" in event]
 
 
-def test_frames_that_come_in_bunches_are_no_second_device() -> None:
+def test_frames_in_bunches_are_no_second_device_and_stopped_nodes_are_woken_before_they_are_asked():
     with rig() as made:
         settle(made)
         listener = Listener(made.joint)
@@ -125,13 +137,7 @@ def test_frames_that_come_in_bunches_are_no_second_device() -> None:
         assert said.startswith("node 2: some frames are missing, others come several in one cycle")
         made.run(1500)
         assert not made.status["conditions"]
-        listener.close()
-
-
-def test_nodes_that_somebody_stopped_are_woken_before_they_are_asked() -> None:
-    with rig() as made:
-        settle(made)
-        listener = Listener(made.joint)
+        # Nodes that somebody stopped are woken before they are asked.
         listener.send(0x000, b"\x02\x00")
         back = next(k for k, e in enumerate(made.run(3000)[100:]) if not e.status & Status.STALE)
         listener.close()
@@ -140,7 +146,7 @@ def test_nodes_that_somebody_stopped_are_woken_before_they_are_asked() -> None:
 
 
 @pytest.mark.parametrize("segment_bytes", [7, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 1))])
-def test_a_drive_that_answers_sdo_without_end_harms_itself_only(segment_bytes: int) -> None:
+def test_a_drive_that_answers_sdo_without_end_harms_itself_only(segment_bytes):
     with rig() as made:
         settle(made)
         made.faults.endless_sdo(made.node(2), segment_bytes)
@@ -152,37 +158,3 @@ def test_a_drive_that_answers_sdo_without_end_harms_itself_only(segment_bytes: i
         assert made.status["nodes"]["1"]["missing"] == 0
         made.faults.endless_sdo(made.node(2), -1)
         assert any(valid(made.run(ENOUGH + 3000)))
-
-
-def test_whatever_goes_wrong_in_the_configuration_of_a_node_is_that_nodes_own(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    with rig() as made:
-        settle(made)
-        made.run(2000)  # enough is learned to hold blocks after a reboot against
-
-        def broken(*_: object, **__: object) -> None:
-            raise OverflowError("int too large to convert to float")
-
-        monkeypatch.setattr("drivelink.canopen.node.offer", broken)
-        made.faults.reboot(made.node(1))
-        estimates = made.run(1500)
-        assert len(estimates) >= 1499  # a cycle that lacks a frame is concluded with the next SYNC
-        assert "node 1 cannot be configured: node 1: OverflowError in its configuration: int too large" in (
-            " ".join(made.events)
-        )
-        monkeypatch.undo()
-        assert any(valid(made.run(ENOUGH + 3000)))  # and until motion has shown its zero
-
-
-def test_cycles_lost_because_this_machine_is_too_slow_are_said_with_their_number() -> None:
-    with rig() as made:
-        made.run(100)
-        made.daemon.loop.overruns += 3  # as the pacing counts them
-        made.run(100)
-        assert (
-            "this machine is too slow for the cycle of 1 ms: cycles left out so far: 3; drivelink doctor names the "
-            "cause"
-        ) in made.events
-        made.run(2000)
-        assert "this machine keeps up with the cycle again; cycles left out: 3" in made.events

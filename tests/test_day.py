@@ -46,7 +46,7 @@ def kept_one(folder: Path) -> Path:
     return recording
 
 
-def test_a_row_a_second_in_two_files_of_bounded_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_row_a_second_in_two_files_of_bounded_size(tmp_path, monkeypatch):
     monkeypatch.setattr(day, "_MOST", 20_000)
     written = Written(tmp_path)
     written.day.row()  # no estimate, no row
@@ -63,7 +63,7 @@ def test_a_row_a_second_in_two_files_of_bounded_size(tmp_path: Path, monkeypatch
     assert len(thin) <= 21 and all(row[1] == 700.0 and 0.5 < (row[3] or 0.0) < 1.0 for row in thin)
 
 
-def test_a_full_disk_is_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_full_disk_is_one_line(tmp_path, caplog):
     written = Written(tmp_path / "missing")
     written.run(5)
     assert len(caplog.records) == 1
@@ -72,7 +72,7 @@ def test_a_full_disk_is_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixtur
     assert len(day.rows(tmp_path / "missing", "elbow")) == 1
 
 
-def test_the_page_links_events_to_recording_and_diagnosis(tmp_path: Path) -> None:
+def test_the_page_links_events_to_recording_and_diagnosis(tmp_path):
     Written(tmp_path).run(200)
     recording = kept_one(tmp_path)
     (tmp_path / "secret.toml").write_text("x")

@@ -1,7 +1,5 @@
 """`drivelink dbc`: another tool decodes the joint's frames to the values that drivelink publishes."""
 
-from pathlib import Path
-
 import pytest
 
 from drivelink.cli import main
@@ -23,7 +21,7 @@ OTHER = MappedObject(signal=Signal.OTHER, index=0x6041, subindex=0, bits=16, sig
 LAYOUT = NodeLayout(node_id=3, motor=0, tpdos=(TpdoLayout(cob_id=0x183, objects=(POSITION, CURRENT, OTHER)),))
 
 
-def test_a_recordings_frames_are_decoded_in_si(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recordings_frames_are_decoded_in_si(tmp_path, capsys):
     path, out = tmp_path / "r.mcap", tmp_path / "elbow.dbc"
     sink = open_sink(path, parse(TEXT), TEXT)
     sink.mapping(mapping_document("elbow", [LAYOUT], TEXT, daemon=True), 10**18)
@@ -36,9 +34,7 @@ def test_a_recordings_frames_are_decoded_in_si(tmp_path: Path, capsys: pytest.Ca
     assert main(["dbc", str(path), "--out", str(out)]) != 0  # never replaced unasked
 
 
-def test_a_joint_without_a_known_mapping_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_joint_without_a_known_mapping_is_one_line(tmp_path, capsys):
     joint = tmp_path / "elbow.toml"
     joint.write_text(TEXT + '[zenoh]\nendpoint = "tcp/127.0.0.1:1"\n')
     assert main(["dbc", str(joint)]) != 0

@@ -49,7 +49,7 @@ def chi_squared(k: FloatArray, std: FloatArray) -> float:
 
 
 @pytest.mark.slow
-def test_parts_of_a_recording_agree_within_what_is_said_though_physics_is_missing() -> None:
+def test_parts_of_a_recording_agree_within_what_is_said_though_physics_is_missing():
     """Without the link's dynamics, as most machines are; nothing of what is missing is declared."""
     model = kit.model(linked=False)
     pairs = [
@@ -62,7 +62,7 @@ def test_parts_of_a_recording_agree_within_what_is_said_though_physics_is_missin
 
 
 @pytest.mark.slow
-def test_an_effect_that_moves_the_stiffness_is_in_the_interval_of_a_fit() -> None:
+def test_an_effect_that_moves_the_stiffness_is_in_the_interval_of_a_fit():
     """Undeclared hysteresis, which stiffens the joint in all parts of the motion alike."""
     missing = [{"hysteresis_nm": nm, "hysteresis_rad": rad} for nm, rad in ((0.6, 0.01), (2.0, 0.05))]
     for record in kit.World(missing).run():
@@ -72,7 +72,7 @@ def test_an_effect_that_moves_the_stiffness_is_in_the_interval_of_a_fit() -> Non
         assert 0.04 < k / kit.STIFFNESS - 1.0 < SIGMA_95 * std / kit.STIFFNESS
 
 
-def test_an_inertia_moves_as_far_as_it_is_declared_unsure() -> None:
+def test_an_inertia_moves_as_far_as_it_is_declared_unsure():
     """Twenty per cent too much, declared unsure and declared as certain."""
     (record,) = kit.World([{}]).run()
     exact = kit.model(linked=False)
@@ -85,7 +85,7 @@ def test_an_inertia_moves_as_far_as_it_is_declared_unsure() -> None:
     assert abs(found[1e-5]) < 0.02 * kit.INERTIA
 
 
-def test_the_joint_file_says_how_sure_the_inertia_is() -> None:
+def test_the_joint_file_says_how_sure_the_inertia_is():
     text = 'name = "axis"\n[[motor]]\ninertia_kg_m2 = 0.1\ninertia_std_relative = {}\n'
     assert jointfile.parse(text.format(0.2)).model().motors[0].inertia_std_relative == 0.2
     for wrong in ("0.0", "-0.1", '"wide"'):

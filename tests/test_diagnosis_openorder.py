@@ -12,33 +12,25 @@ def joint(transmission: Transmission) -> JointModel:
 
 
 def stiffening(power: float) -> Finding:
-    return Finding(
-        name="higher_order_stiffness",
-        location="transmission",
-        motor=0,
-        parameters={"coefficient": 400.0, "power": power},
-        std={},
-    )
+    values = {"coefficient": 400.0, "power": power}
+    return Finding(name="higher_order_stiffness", location="transmission", motor=0, parameters=values, std={})
 
 
 @pytest.mark.parametrize(("power", "order"), [(3.0, 2), (5.0, 3)])
-def test_an_open_order_follows_the_power_that_was_found(power: float, order: int) -> None:
+def test_an_open_order_follows_the_power_that_was_found(power, order):
     model = raised(joint(Transmission(model="polynomial")), [stiffening(power)])
     assert model is not None
     assert model.motors[0].transmission.order == order
 
 
 @pytest.mark.parametrize(
-    "transmission",
+    ("transmission", "found"),
     [
-        Transmission(model="polynomial", order=1),
-        Transmission(model="polynomial", parameters={"coefficients_nm_rad": (150.0,)}),
-        Transmission(model="vsa-ii"),
+        (Transmission(model="polynomial", order=1), [stiffening(3.0)]),
+        (Transmission(model="polynomial", parameters={"coefficients_nm_rad": (150.0,)}), [stiffening(3.0)]),
+        (Transmission(model="vsa-ii"), [stiffening(3.0)]),
+        (Transmission(model="polynomial"), []),  # nothing to raise it for
     ],
 )
-def test_what_the_joint_file_says_is_left_and_the_effect_stays_an_effect(transmission: Transmission) -> None:
-    assert raised(joint(transmission), [stiffening(3.0)]) is None
-
-
-def test_without_a_stiffening_there_is_nothing_to_raise() -> None:
-    assert raised(joint(Transmission(model="polynomial")), []) is None
+def test_what_the_joint_file_says_is_left_and_the_effect_stays_an_effect(transmission, found):
+    assert raised(joint(transmission), found) is None

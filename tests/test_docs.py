@@ -50,26 +50,24 @@ def subparsers() -> dict[str, argparse.ArgumentParser]:
     return dict(action.choices)  # type: ignore[arg-type]
 
 
-def test_pages_ask_for_every_part_that_is_made_from_the_code_and_for_no_other() -> None:
-    made = generator()
-    texts = [page.read_text(encoding="utf-8") for page in PAGES]
-    asked = [name for text in texts for name in made.ASKED.findall(text)]
-    asked += [name for text in texts for _, name, _ in made.MARKED.findall(text)]
+def test_tables_in_pages_are_those_of_the_code_and_each_is_asked_for():
+    made, texts = generator(), {page: page.read_text(encoding="utf-8") for page in PAGES}
+    asked = [name for text in texts.values() for name in made.ASKED.findall(text)]
+    asked += [name for text in texts.values() for _, name, _ in made.MARKED.findall(text)]
     assert sorted(asked) == sorted(made.PARTS)
+    for page, text in texts.items():
+        assert made.updated(text) == text, f"{page}: python docs/generate.py writes it"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
-def test_tables_in_a_page_are_those_of_the_code(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    assert generator().updated(text) == text, "python docs/generate.py writes them"
-
-
-@pytest.mark.parametrize("name", generator().PARTS)
-def test_no_cell_of_a_table_from_the_code_is_unexplained(name: str) -> None:
-    rows = re.findall(r"^\| .* \|$", generator().PARTS[name](), re.MULTILINE)
-    assert all(row.count(" | ") == rows[0].count(" | ") for row in rows)
-    meanings = [row.rpartition(" | ")[2] for row in rows]
-    assert (rows and all(meanings)) or name == "commands"
+def test_no_cell_of_a_table_from_the_code_is_unexplained_and_every_key_of_a_joint_file_is_in_one():
+    parts = {name: part() for name, part in generator().PARTS.items()}
+    for name, text in parts.items():
+        rows = re.findall(r"^\| .* \|$", text, re.MULTILINE)
+        assert all(row.count(" | ") == rows[0].count(" | ") for row in rows), name
+        assert (rows and all(row.rpartition(" | ")[2] for row in rows)) or name == "commands", name
+    keys = keys_of(jointfile.JointFile)
+    assert len(keys) > 60
+    assert not [key for key in keys if f"| `{key}` |" not in parts["joint file"]]
 
 
 def keys_of(section: object) -> set[str]:
@@ -84,54 +82,18 @@ def keys_of(section: object) -> set[str]:
     return set().union(*(keys_of(hints[name]) or {name} for name in names))
 
 
-def test_every_key_of_a_joint_file_is_in_its_reference() -> None:
-    text = generator().PARTS["joint file"]()
-    keys = keys_of(jointfile.JointFile)
-    assert len(keys) > 60
-    assert not [key for key in keys if f"| `{key}` |" not in text]
+def test_every_verb_explains_each_of_its_arguments():
+    verbs = subparsers().items()
+    assert not [f"{verb} {action.dest}" for verb, p in verbs for action in p._actions if not action.help]
 
 
-def test_every_verb_explains_each_of_its_arguments() -> None:
-    silent = [
-        f"{verb} {action.dest}"
-        for verb, p in subparsers().items()
-        for action in p._actions
-        if not action.help
-    ]
-    assert not silent
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
-def test_files_that_a_page_names_exist(page: Path) -> None:
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_files_links_and_programs_of_a_page_exist_and_its_code_parses(page):
     text = page.read_text(encoding="utf-8")
     named = re.findall(r"`((?:examples|benchmarks|docs|tests|sim|estimator|drivelink)/[\w./*-]+)`", text)
-    missing = [name for name in named if "*" not in name and not (ROOT / name).exists()]
-    assert not missing
-
-
-@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
-def test_pages_and_pictures_that_a_page_links_to_exist(page: Path) -> None:
-    links = re.findall(r"\]\(([\w./-]+)(?:#[\w-]*)?\)", page.read_text(encoding="utf-8"))
+    assert page not in PAGES or not [n for n in named if "*" not in n and not (ROOT / n).exists()]
+    links = re.findall(r"\]\(([\w./-]+)(?:#[\w-]*)?\)", text)
     assert not [link for link in links if not (page.parent / link).exists()]
-
-
-@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_that_a_page_shows_can_be_parsed(page: Path) -> None:
-    parser = cli.make_parser(list(cli.VERBS))
-    text = page.read_text(encoding="utf-8")
-    for line in re.findall(r"^ {0,4}(?:sudo |\.venv/bin/)?drivelink ([a-z].*)$", text, re.MULTILINE):
-        command = shlex.split(re.split(r"\s{2,}|\s[#|&]|`", line)[0])
-        if command[0] in cli.VERBS and not set(line) & set("…["):
-            assert parser.parse_args(command).verb == command[0]
-    verbs = subparsers()
-    for fragment in re.findall(r"`drivelink ([a-z][^`]* --[^`]*)`", text):
-        known = verbs[fragment.split()[0]]._option_string_actions
-        assert set(re.findall(r"--[\w-]+", fragment)) <= set(known), fragment
-
-
-@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
-def test_programs_and_code_that_a_page_shows_are_there_and_parse(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
     programs = re.findall(r"\bpython ((?:benchmarks|examples|docs)/[\w/.-]+\.py)", text)
     assert not [program for program in programs if not (ROOT / program).is_file()]
     for language, code in re.findall(r"^```(\w+)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
@@ -144,6 +106,20 @@ def test_programs_and_code_that_a_page_shows_are_there_and_parse(page: Path) -> 
             tomllib.loads(code)
 
 
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_that_a_page_shows_can_be_parsed(page):
+    parser = cli.make_parser(list(cli.VERBS))
+    text = page.read_text(encoding="utf-8")
+    for line in re.findall(r"^ {0,4}(?:sudo |\.venv/bin/)?drivelink ([a-z].*)$", text, re.MULTILINE):
+        command = shlex.split(re.split(r"\s{2,}|\s[#|&]|`", line)[0])
+        if command[0] in cli.VERBS and not set(line) & set("…["):
+            assert parser.parse_args(command).verb == command[0]
+    verbs = subparsers()
+    for fragment in re.findall(r"`drivelink ([a-z][^`]* --[^`]*)`", text):
+        known = verbs[fragment.split()[0]]._option_string_actions
+        assert set(re.findall(r"--[\w-]+", fragment)) <= set(known), fragment
+
+
 @pytest.mark.parametrize(
     ("name", "heading", "known"),
     [
@@ -153,13 +129,13 @@ def test_programs_and_code_that_a_page_shows_are_there_and_parse(page: Path) -> 
         ("simulation.md", "Excitation", set(KINDS)),
     ],
 )
-def test_a_reference_page_lists_what_the_code_knows(name: str, heading: str, known: set[str]) -> None:
+def test_a_reference_page_lists_what_the_code_knows(name, heading, known):
     page = (REFERENCE / name).read_text(encoding="utf-8")
     section = re.split(r"\n##+ ", page.partition(f"# {heading}")[2])[0]
     assert known <= set(re.findall(r"`([\w/-]+)`", section))
 
 
-def test_the_reference_describes_every_key_of_the_status_document() -> None:
+def test_the_reference_describes_every_key_of_the_status_document():
     page = (REFERENCE / "wire.md").read_text(encoding="utf-8")
     section = page.partition("## Status document")[2].partition("\n## ")[0]
     first_cells = " ".join(re.findall(r"^\| (`.*?) \|", section, re.MULTILINE))
@@ -167,24 +143,24 @@ def test_the_reference_describes_every_key_of_the_status_document() -> None:
         assert set(rig.status) == set(re.findall(r"`(\w+)`", first_cells))
 
 
-def test_the_benchmarks_page_lists_every_program() -> None:
+def test_the_benchmarks_page_lists_every_program():
     folder = ROOT / "benchmarks"
     text = (folder / "README.md").read_text(encoding="utf-8")
     programs = {path.stem for path in folder.glob("*.py") if "argparse" in path.read_text(encoding="utf-8")}
     assert programs <= set(re.findall(r"`(\w+)(?:\.py)?`", text)) | {"run_all"}
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.toml")), ids=lambda path: path.name)
-def test_example_joint_files_are_valid(path: Path) -> None:
-    assert jointfile.load(path).model().motors
+def test_examples_are_listed_valid_and_their_cases_those_of_the_package():
+    listed = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
+    for path in (ROOT / "examples").iterdir():
+        assert path.name == "README.md" or path.name in listed, path.name
+        if path.suffix == ".toml":
+            assert jointfile.load(path).model().motors
+    for path in (ROOT / "drivelink" / "joints").glob("*.toml"):
+        assert (ROOT / "examples" / path.name).read_text(encoding="utf-8") == path.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "drivelink" / "joints").glob("*.toml")), ids=lambda p: p.name)
-def test_the_cases_among_the_examples_are_those_of_the_package(path: Path) -> None:
-    assert (ROOT / "examples" / path.name).read_text(encoding="utf-8") == path.read_text(encoding="utf-8")
-
-
-def test_each_of_ten_decisions_names_its_rival_and_a_figure() -> None:
+def test_each_of_ten_decisions_names_its_rival_and_a_figure():
     text = (DOCS / "explanation" / "decisions.md").read_text(encoding="utf-8")
     decisions = re.split(r"^## \d+\. ", text, flags=re.MULTILINE)[1:]
     assert len(decisions) == 10
@@ -192,17 +168,9 @@ def test_each_of_ten_decisions_names_its_rival_and_a_figure() -> None:
         assert re.search(r"\*Rival\*: .*\d", decision, re.DOTALL), decision
 
 
-def test_the_workflow_and_the_hooks_run_programs_that_are_there() -> None:
+def test_the_workflow_and_the_hooks_run_programs_that_are_there():
     workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
     assert "- run: .ci/run\n" in workflow and (ROOT / ".ci" / "run").stat().st_mode & 0o100
     hooks = re.findall(r"entry: (.*)", (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))
-    run = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-    assert hooks and all(
-        hook.removesuffix(" --force-exclude") in run.replace("check .", "check") for hook in hooks
-    )
-
-
-def test_every_example_is_listed() -> None:
-    listed = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
-    for path in (ROOT / "examples").iterdir():
-        assert path.name == "README.md" or path.name in listed, path.name
+    run = (ROOT / ".ci" / "run").read_text(encoding="utf-8").replace("check .", "check")
+    assert hooks and all(hook.removesuffix(" --force-exclude") in run for hook in hooks)

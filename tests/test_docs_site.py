@@ -47,7 +47,7 @@ def address(site: Path) -> Iterator[str]:
     server.server_close()
 
 
-def test_no_page_loads_anything_from_another_host(site: Path) -> None:
+def test_no_page_loads_anything_from_another_host(site):
     pages = list(site.rglob("*.html"))
     assert len(pages) > 30
     loaded = re.compile(
@@ -63,7 +63,7 @@ def test_no_page_loads_anything_from_another_host(site: Path) -> None:
     assert not found
 
 
-def test_formulas_diagrams_and_the_help_of_commands_are_rendered(site: Path) -> None:
+def test_formulas_diagrams_and_the_help_of_commands_are_rendered(site):
     estimation = (site / "explanation" / "estimation.html").read_text(encoding="utf-8")
     assert "<math" in estimation
     assert "arithmatex" not in estimation
@@ -73,8 +73,8 @@ def test_formulas_diagrams_and_the_help_of_commands_are_rendered(site: Path) -> 
 
 @pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
 def test_in_a_browser_nothing_is_asked_of_another_host_and_a_phone_shows_whole_pages_and_searches(
-    site: Path, address: str, tmp_path: Path
-) -> None:
+    site, address, tmp_path
+):
     pages = ["index.html", "architecture.html", "explanation/estimation.html", "reference/commands.html"]
     with chromium.Chromium(tmp_path / "profile") as browser:
         browser.resize(390, 844)

@@ -56,11 +56,11 @@ class HandMovedJoint:
         self.true["link_position"] = 0.0
         self.said: list[str] = []
         self.unread: set[str] = set()
-        self.push = 1.5
+        self.push, self.std = 1.5, 1e-4
 
     def read(self, seconds: float) -> Mapping[str, Value]:
         read = (name for name in self.true if name not in self.unread)
-        return {name: Value(self.wrong.get(name, 1.0) * self.true[name], 1e-4) for name in read}
+        return {name: Value(self.wrong.get(name, 1.0) * self.true[name], self.std) for name in read}
 
     def show(self, text: str) -> None:
         self.said.append(text)
@@ -88,7 +88,7 @@ def checked(
     return check_by_hand(joint(arrangement, gear), rig, rig)
 
 
-def test_what_is_right_is_ticked_and_nothing_is_to_paste() -> None:
+def test_what_is_right_is_ticked_and_nothing_is_to_paste():
     for arrangement, motors in (("single", 1), ("antagonistic", 2), ("serial", 2)):
         done = checked({}, arrangement)
         ticked = {(mark.channel, mark.what) for mark in done.marks if mark.good}
@@ -112,9 +112,7 @@ def test_what_is_right_is_ticked_and_nothing_is_to_paste() -> None:
         ({"link_position": 4.0}, 1.0, ["link.encoder.counts_per_rev = 256300"]),
     ],
 )  # fmt: skip
-def test_each_fault_ends_in_the_line_that_cures_it(
-    wrong: dict[str, float], gear: float, lines: list[str]
-) -> None:
+def test_each_fault_ends_in_the_line_that_cures_it(wrong, gear, lines):
     done = checked(wrong, gear=gear)
     got = [line.partition(" = ") for line in done.paste]
     want = [line.partition(" = ") for line in lines]
@@ -124,19 +122,28 @@ def test_each_fault_ends_in_the_line_that_cures_it(
     assert not done.as_dict()["good"]
 
 
-def test_a_reversed_motor_of_a_pair_is_named() -> None:
+def test_a_reversed_motor_of_a_pair_is_named():
     done = checked({"motor2_position": -1.0, "motor2_torque": -1.0}, "antagonistic")
     assert done.paste == ["motor[2].drive.direction = -1"]
     assert {mark.channel for mark in done.marks if mark.good is False} == {"motor2_position", "motor2_torque"}
 
 
-def test_a_torque_is_measured_against_a_known_push() -> None:
-    assert checked({}, **{"Push": "1.4"}).paste == []
-    done = checked({"motor1_torque": 1e3}, **{"Push": "1.5"})
-    assert done.paste == ["motor[1].drive.torque_constant_nm_a = 5e-05"]
+@pytest.mark.parametrize(
+    ("wrong", "push", "reply", "paste"),
+    [
+        ({}, 1.5, "1.4", []),
+        ({"motor1_torque": 1e3}, 1.5, "1.5", ["motor[1].drive.torque_constant_nm_a = 5e-05"]),
+        ({}, -1.5, "-1.4", []),  # a push in the negative direction is typed with its sign
+        ({"motor1_torque": -1.0}, -1.5, "-1.4", ["motor[1].drive.torque_direction = -1"]),
+    ],
+)
+def test_a_torque_is_measured_against_a_known_push(wrong, push, reply, paste):
+    rig = HandMovedJoint(wrong, {"Push": reply})
+    rig.push = push
+    assert check_by_hand(joint(), rig, rig).paste == paste
 
 
-def test_what_was_not_seen_is_not_ticked() -> None:
+def test_what_was_not_seen_is_not_ticked():
     done = checked({}, **{"Turn": "s", "Let": "s"})
     assert done.marks and all(mark.good is None for mark in done.marks)
     assert done.as_dict()["good"] is None
@@ -147,25 +154,7 @@ def test_what_was_not_seen_is_not_ticked() -> None:
     assert done.paste == []
 
 
-def test_an_amount_has_units_and_nonsense_is_asked_again() -> None:
-    replies = iter(["lots", "1.536 rad"])
-
-    class Person(HandMovedJoint):
-        def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
-            if text.startswith("Turn the joint"):
-                reply = next(replies)
-                if reply == "lots":
-                    return reply
-                super().ask(text, meanwhile)
-                return reply
-            return super().ask(text, meanwhile)
-
-    rig = Person({})
-    done = check_by_hand(joint(), rig, rig)
-    assert done.paste == [] and "expected an amount like 45 or 0.8 rad, got lots" in rig.said
-
-
-def test_a_linear_axis_is_moved_in_millimetres_and_pushed_in_newtons() -> None:
+def test_a_linear_axis_is_moved_in_millimetres_and_pushed_in_newtons():
     rig = HandMovedJoint({})
     done = check_by_hand(joint(axis="linear"), rig, rig)
     assert done.good and done.paste == []
@@ -192,36 +181,33 @@ def once(ask: Callable[..., str], start: str, then: str) -> Callable[..., str]:
     return answer
 
 
-def test_a_push_in_the_negative_direction_is_typed_with_its_sign() -> None:
-    rig = HandMovedJoint({}, {"Push": "-1.4"})
-    rig.push = -1.5
-    assert check_by_hand(joint(), rig, rig).good
-    rig = HandMovedJoint({"motor1_torque": -1.0}, {"Push": "-1.4"})
-    rig.push = -1.5
-    assert check_by_hand(joint(), rig, rig).paste == ["motor[1].drive.torque_direction = -1"]
+def test_an_amount_has_units_and_nonsense_is_asked_again():
+    rig = HandMovedJoint({}, {"Turn": "lots"})
+    rig.ask = once(rig.ask, "Turn", "1.536 rad")  # type: ignore[method-assign]
+    assert check_by_hand(joint(), rig, rig).paste == []
+    assert "expected an amount like 45 or 0.8 rad, got lots" in rig.said
 
 
-def test_of_two_motors_each_torque_has_its_own_gear_and_what_is_not_read_is_not_judged() -> None:
+def test_of_two_motors_each_torque_has_its_own_gear_and_what_is_not_read_is_not_judged():
+    def pushed(wrong: dict[str, float], unread: str = "") -> ByHand:
+        rig = HandMovedJoint(wrong, {"Push": "3.0"})
+        rig.unread.add(unread)
+        return check_by_hand(joint("antagonistic"), rig, rig)
+
     # The second motor's gear of 100 is not declared: its position reads 100 times as far, its torque a hundredth.
-    wrong = {"motor2_position": 100.0, "motor2_torque": 0.01}
-    rig = HandMovedJoint(wrong, {"Push": "3.0"})
-    done = check_by_hand(joint("antagonistic"), rig, rig)
+    done = pushed({"motor2_position": 100.0, "motor2_torque": 0.01})
     assert [line.partition(" = ")[0] for line in done.paste] == ["motor[2].drive.gear_ratio"]
     scales = {mark.channel: mark.good for mark in done.marks if mark.what == "scale"}
     assert scales["motor1_torque"] is scales["motor2_torque"] is True
 
-    rig = HandMovedJoint({}, {"Push": "3.0"})
-    rig.unread.add("motor2_torque")
-    done = check_by_hand(joint("antagonistic"), rig, rig)
-    torques = {(mark.channel, mark.what): mark.good for mark in done.marks if "torque" in mark.channel}
-    assert torques == {
-        ("motor1_torque", "sign"): True, ("motor2_torque", "sign"): None, ("motor1_torque", "scale"): None,
-    }  # fmt: skip
+    torques = [
+        (m.channel, m.what, m.good) for m in pushed({}, "motor2_torque").marks if "torque" in m.channel
+    ]
+    assert sorted(torques) == [
+        ("motor1_torque", "scale", None), ("motor1_torque", "sign", True), ("motor2_torque", "sign", None),
+    ]  # fmt: skip
 
-    rig = HandMovedJoint(
-        {"motor1_torque": 30.0}, {"Push": "3.0"}
-    )  # one of two is wrong, and nobody knows which
-    done = check_by_hand(joint("antagonistic"), rig, rig)
+    done = pushed({"motor1_torque": 30.0})  # one of two is wrong, and nobody knows which
     assert not done.good and done.paste == []
     assert any("in one of them or in both" in mark.text for mark in done.marks)
 
@@ -257,54 +243,39 @@ def typed(*lines: str) -> Iterator[None]:
         yield
 
 
-def test_the_command_leads_through_the_steps_and_says_what_was_not_checked(
-    bench: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_leads_through_the_steps_and_says_what_was_not_checked(bench, capsys):
+    command = ["doctor", str(bench), "--move", "--seconds", "0.05"]
     with typed("", "", "", "1.5"):  # nobody moves the simulated joint
-        assert main(["doctor", str(bench), "--move", "--seconds", "0.05"]) == 1
+        assert main(command) == 1
     said = capsys.readouterr().out
-    assert (
-        "> Hold the joint still" in said and "> Turn the joint by 90°" in said and "> Push the joint" in said
-    )
+    for text in (
+        "> Hold the joint still",
+        "> Turn the joint by 90°",
+        "> Push the joint",
+        "0 checked and right",
+    ):
+        assert text in said
     assert "· motor 1 position, sign: did not follow" in said
-    assert "0 checked and right" in said
+    with typed("", "s", "s"):
+        assert main([*command, "--json"]) == 1
+    both = capsys.readouterr()
+    document = json.loads(both.out)  # alone on stdout
+    assert document["schema"] == "drivelink.doctor.move/1"
+    assert document["good"] is None and document["paste"] == []
+    assert "> Hold the joint still" in both.err
+    with typed():
+        assert main(command) == 2
+    assert capsys.readouterr().err == "drivelink doctor: --move: nobody answers: run it in a terminal\n"
 
 
-def test_a_reading_that_stands_still_is_as_uncertain_as_its_count() -> None:
+def test_a_reading_is_as_uncertain_as_its_count_and_two_counts_are_no_reaction_to_a_push():
     def collect(seconds: float) -> Readings:
         return {(Signal.MOTOR_TORQUE, 0): Series([0.0, 0.1], [0.24, 0.24], [0.0, 0.0], step=0.12)}
 
     read = LiveValues(collect).read(0.1)["motor1_torque"]
     assert read.mean == 0.24 and read.std == pytest.approx(0.12 / math.sqrt(12.0))
-
-
-def test_a_torque_that_moves_by_two_counts_is_no_reaction_to_a_push() -> None:
-    class Rounded(HandMovedJoint):
-        def read(self, seconds: float) -> Mapping[str, Value]:
-            step = 0.12
-            return {
-                name: Value(value.mean, step / math.sqrt(12.0))
-                for name, value in super().read(seconds).items()
-            }
-
-    rig = Rounded({})
-    rig.push = 0.24
+    rig = HandMovedJoint({})
+    rig.std, rig.push = read.std, 0.24
     done = check_by_hand(joint(), rig, rig)
     (mark,) = (mark for mark in done.marks if mark.channel == "motor1_torque")
     assert mark.good is None and "no reaction" in mark.text and "motor1_torque" not in done.needed
-
-
-def test_the_command_s_json_is_alone_on_stdout(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with typed("", "s", "s"):
-        assert main(["doctor", str(bench), "--move", "--json", "--seconds", "0.05"]) == 1
-    said = capsys.readouterr()
-    document = json.loads(said.out)
-    assert document["schema"] == "drivelink.doctor.move/1"
-    assert document["good"] is None and document["paste"] == []
-    assert "> Hold the joint still" in said.err
-
-
-def test_nobody_at_the_terminal_is_one_line(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with typed():
-        assert main(["doctor", str(bench), "--move"]) == 2
-    assert capsys.readouterr().err == "drivelink doctor: --move: nobody answers: run it in a terminal\n"

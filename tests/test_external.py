@@ -39,14 +39,8 @@ PUSHES = ((8.0, 1.5), (9.0, -1.5), (10.0, 0.8), (11.0, -3.0))  # begin, torque; 
 PUSH_S = 0.4
 LEARNED = 6000  # samples of free motion after which the spring is known
 W = EstimatorSettings().external_bandwidth_rad_s
-LINK = LinkDynamics(
-    inertia_kg_m2=0.4,
-    viscous_damping_nm_s_rad=0.1,
-    gravity_nm=GRAVITY_NM,
-    inertia_std_kg_m2=0.0,
-    viscous_damping_std_nm_s_rad=0.0,
-    gravity_std_nm=0.0,
-)
+CERTAIN = {"inertia_std_kg_m2": 0.0, "viscous_damping_std_nm_s_rad": 0.0, "gravity_std_nm": 0.0}
+LINK = LinkDynamics(inertia_kg_m2=0.4, viscous_damping_nm_s_rad=0.1, gravity_nm=GRAVITY_NM, **CERTAIN)
 
 
 def world(seed=1, external=None, effects=(), payload=(0.0, 0.0)):
@@ -54,25 +48,16 @@ def world(seed=1, external=None, effects=(), payload=(0.0, 0.0)):
     spring = Spring(model="polynomial", parameters={"coefficients_nm_rad": (150.0, 1500.0)})
     table = {"kind": "rich", "amplitude_nm": 8.0, "low_hz": 0.15, "high_hz": 4.0}
     excitation = build(table | {"centring_nm_rad": 10.0, "centring_nm_s_rad": 1.0}, 1)
+    motor = MotorPlant(inertia_kg_m2=0.125, viscous_damping_nm_s_rad=0.8, spring=spring)
+    inertia, gravity = 0.4 + payload[0], GRAVITY_NM + payload[1]
+    link = LinkPlant(inertia_kg_m2=inertia, viscous_damping_nm_s_rad=0.1, gravity_nm=gravity)
+    drive = DriveHardware(
+        counts_per_rev=4096.0, gear_ratio=50.0, torque_constant_nm_a=0.05, rated_current_a=6.0,
+        current_noise_a=0.012,
+    )  # fmt: skip
     return World(
-        JointPlant(
-            arrangement="single",
-            motors=(MotorPlant(inertia_kg_m2=0.125, viscous_damping_nm_s_rad=0.8, spring=spring),),
-            link=LinkPlant(
-                inertia_kg_m2=0.4 + payload[0],
-                viscous_damping_nm_s_rad=0.1,
-                gravity_nm=GRAVITY_NM + payload[1],
-            ),
-        ),
-        (
-            DriveHardware(
-                counts_per_rev=4096.0,
-                gear_ratio=50.0,
-                torque_constant_nm_a=0.05,
-                rated_current_a=6.0,
-                current_noise_a=0.012,
-            ),
-        ),
+        JointPlant(arrangement="single", motors=(motor,), link=link),
+        (drive,),
         LinkEncoder(counts_per_rev=2.0**17),
         excitation=replace(excitation, external=external),
         effects=[parse(text) for text in ("coulomb_friction=0.75", *effects)],
@@ -133,35 +118,35 @@ def filtered(x):
     return StateVariableFilter(3, W, T).apply(x)[0]
 
 
-def test_the_torque_of_a_push_is_found_within_three_per_cent_of_it(pushed, estimated):
+def test_a_push_is_found_within_three_per_cent_raises_a_contact_and_nothing_else_does(pushed, estimated):
     for begin, size in PUSHES:
+        at = round(begin / T)
         # 60 ms are four delays of the filter: what it still lacks of a step then is 0.05 %
-        window = slice(round((begin + 0.06) / T), round((begin + PUSH_S) / T))
+        window = slice(at + round(0.06 / T), at + round(PUSH_S / T))
         assert estimated.valid[window].all()
         off = estimated.torque[window] - size
         assert abs(np.mean(off)) < 0.03 * abs(size), (begin, size, np.mean(off))
         # What is left around that is the noise that the link encoder's steps make of 0.4 kg·m²: 0.045 N·m.
         assert np.sqrt(np.mean(off**2)) < 0.03 * abs(size) + 0.05
-
-
-def test_the_standard_deviation_is_that_of_the_error(pushed, estimated):
-    """It holds its error, and is not much larger either: a controller's threshold is made of it."""
-    use = estimated.valid & (np.arange(len(estimated.torque)) > LEARNED)
-    off = (estimated.torque - filtered(pushed["external_torque_nm"]))[use] / estimated.std[use]
-    assert np.mean(np.abs(off) < 1.96) > 0.90
-    # The motor's dry friction is undeclared: what the balance leaves of it widens the interval.
-    assert np.sqrt(np.mean(off**2)) > 0.1
-
-
-def test_a_contact_is_raised_by_pushes_and_by_nothing_else(estimated):
-    for begin, _ in PUSHES:
-        at = round(begin / T)
         assert not estimated.contact[at - 200 : at].any()
         first = int(np.argmax(estimated.contact[at : at + 400]))
         # Beyond what undeclared friction may be.
         assert estimated.contact[at + first] and first <= 35, (begin, first)
         assert not estimated.contact[at + round((PUSH_S + 0.1) / T)]
     assert not estimated.contact[:8000].any()
+
+
+def test_it_is_valid_where_the_estimate_is_and_its_standard_deviation_is_that_of_the_error(pushed, estimated):
+    """It holds its error, and is not much larger either: a controller's threshold is made of it."""
+    assert not (estimated.valid & ~estimated.estimate_valid).any()
+    assert not (estimated.contact & ~estimated.valid).any()
+    assert not estimated.valid[:100].any()  # the filter has to settle
+    assert np.all(np.isfinite(estimated.torque[estimated.valid]) & (estimated.std[estimated.valid] > 0.0))
+    use = estimated.valid & (np.arange(len(estimated.torque)) > LEARNED)
+    off = (estimated.torque - filtered(pushed["external_torque_nm"]))[use] / estimated.std[use]
+    assert np.mean(np.abs(off) < 1.96) > 0.90
+    # The motor's dry friction is undeclared: what the balance leaves of it widens the interval.
+    assert np.sqrt(np.mean(off**2)) > 0.1
 
 
 @pytest.mark.parametrize("error", [0.02, -0.05, 0.10])
@@ -256,38 +241,16 @@ def test_mode_paper_has_equation_13_and_the_same_external_torque(pushed):
     assert push_found == pytest.approx(-3.0, abs=0.75 + 0.3)
 
 
-def test_it_is_valid_only_where_the_estimate_is_and_the_filter_has_settled(estimated):
-    assert not (estimated.valid & ~estimated.estimate_valid).any()
-    assert not (estimated.contact & ~estimated.valid).any()
-    assert not estimated.valid[:100].any()
-    assert np.all(np.isfinite(estimated.torque[estimated.valid]) & (estimated.std[estimated.valid] > 0.0))
-
-
-def test_nothing_is_said_where_nothing_is_declared(free):
-    estimator = make_estimator(model(None), EstimatorSettings(), T)
-    for sample in samples({name: column[:50] for name, column in free.items()}):
-        estimator.step(sample)
-        assert estimator.external is None and estimator.consistency is None
-
-
-def test_a_rigid_transmission_reveals_nothing_of_the_link(free):
-    estimator = make_estimator(model(model="none", order=None), EstimatorSettings(), T)
+def test_nothing_is_said_where_nothing_is_declared_and_a_rigid_transmission_reveals_nothing(free):
+    undeclared, rigid = (
+        make_estimator(joint, EstimatorSettings(), T)
+        for joint in (model(None), model(model="none", order=None))
+    )
     for sample in samples({name: column[:500] for name, column in free.items()}):
-        estimator.step(sample)
-        assert estimator.external.status == 0 and math.isnan(estimator.external.external_torque_nm)
-
-
-def test_after_a_restart_it_settles_anew(free):
-    estimator = make_estimator(model(), EstimatorSettings(), T)
-    rows = list(samples({name: column[:9000] for name, column in free.items()}))
-    for sample in rows[:8000]:
-        estimator.step(sample)
-    assert estimator.external.status & VALID
-    estimator.step(rows[8200])  # a gap too long to be bridged
-    assert estimator.external.status == 0
-    for sample in rows[8201:8900]:
-        estimator.step(sample)
-    assert estimator.external.status & VALID
+        undeclared.step(sample)
+        assert undeclared.external is None and undeclared.consistency is None
+        rigid.step(sample)
+        assert rigid.external.status == 0 and math.isnan(rigid.external.external_torque_nm)
 
 
 @pytest.mark.parametrize("signal", ["motor", "link"])
@@ -314,18 +277,7 @@ def test_it_returns_when_positions_count_from_elsewhere_and_gravity_is_found_aga
     assert not any(one.status & CONTACT for one in late)
 
 
-def test_a_cycle_without_a_sample_says_so(free):
-    pipeline = JointPipeline(Assembler((), 0), make_estimator(model(), EstimatorSettings(), T))
-    tick = None
-    for sample in samples({name: column[:8000] for name, column in free.items()}):
-        tick = pipeline.take(sample)
-    assert tick.external.status & VALID and tick.external_payload is not None
-    carried = pipeline.carry_on(8000)
-    assert (carried.external.sequence, carried.external.status) == (8000, 0)
-    assert carried.external.external_torque_nm == tick.external.external_torque_nm
-
-
-def test_a_service_bit_that_takes_the_estimates_validity_takes_this_one_too(free):
+def test_a_cycle_without_a_sample_and_a_service_bit_take_its_validity(free):
     class Alarm:
         def step(self, *_):
             return True
@@ -333,36 +285,49 @@ def test_a_service_bit_that_takes_the_estimates_validity_takes_this_one_too(free
         def describe(self):
             return {}
 
-    pipeline = JointPipeline(Assembler((), 0), make_estimator(model(), EstimatorSettings(), T), Alarm())
+    plain, alarmed = (
+        JointPipeline(Assembler((), 0), make_estimator(model(), EstimatorSettings(), T), *alarm)
+        for alarm in ((), (Alarm(),))
+    )
+    tick = None
     for sample in samples({name: column[:8000] for name, column in free.items()}):
-        assert pipeline.take(sample).external.status == 0
+        tick = plain.take(sample)
+        assert alarmed.take(sample).external.status == 0
+    assert tick.external.status & VALID and tick.external_payload is not None
+    carried = plain.carry_on(8000)
+    assert (carried.external.sequence, carried.external.status) == (8000, 0)
+    assert carried.external.external_torque_nm == tick.external.external_torque_nm
 
 
-@pytest.mark.parametrize("sample", [{"q": math.nan}, {"q": 1e300}, {"tau": math.inf}])
-def test_whatever_a_sample_holds_nothing_wrong_is_called_valid(free, sample):
+def test_whatever_a_sample_holds_nothing_wrong_is_called_valid_and_after_a_restart_it_settles_anew(free):
     estimator = make_estimator(model(), EstimatorSettings(), T)
-    rows = list(samples({name: column[:8000] for name, column in free.items()}))
-    for row in rows[:-5]:
-        estimator.step(row)
-    for row in rows[-5:]:
-        spoiled = row._replace(
-            link_position_rad=sample.get("q", row.link_position_rad),
-            motor_torque_nm=(sample.get("tau", row.motor_torque_nm[0]),),
-        )
-        estimator.step(spoiled)
-        assert estimator.external.status == 0
+    rows = list(samples({name: column[:13_000] for name, column in free.items()}))
+    begin = 0
+    for end, spoilt in (
+        (8000, {"link_position_rad": math.nan}),
+        (9000, {"link_position_rad": 1e300}),
+        (10_000, {"motor_torque_nm": (math.inf,)}),
+        (11_000, None),  # a gap too long to be bridged
+    ):
+        for row in rows[begin:end]:
+            estimator.step(row)
+        assert estimator.external.status & VALID, end
+        begin = end + 200 * (spoilt is None)
+        for row in rows[begin : begin + 5] if spoilt else rows[begin : begin + 1]:
+            estimator.step(row._replace(**(spoilt or {})))
+            assert estimator.external.status == 0
+        begin += 5
 
 
 @pytest.mark.parametrize(
     ("key", "value"),
     [("external_bandwidth_rad_s", 0.0), ("contact_torque_nm", -1.0), ("external_bias_s", 0.0)],
 )
-def test_a_setting_that_cannot_be_is_one_line(key, value):
+def test_a_setting_that_cannot_be_is_one_line_and_an_uncertainty_that_is_not_declared_is_the_priors(
+    key, value
+):
     with pytest.raises(EstimatorError, match=f"{key}: expected a finite number"):
         EstimatorSettings(**{key: value})
-
-
-def test_an_uncertainty_that_is_not_declared_is_the_priors():
     link = LinkDynamics(inertia_kg_m2=2.0, viscous_damping_nm_s_rad=0.5, gravity_nm=-6.0)
     assert link.std == pytest.approx((0.2, 0.1, 0.6))
     assert replace(link, gravity_std_nm=0.0).std[2] == 0.0

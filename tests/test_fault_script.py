@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from daemonkit import vsa
-from faultscript import SCRIPT, Fault
+from faultscript import SCRIPT
 from faultstages import LockstepStage
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -24,15 +24,13 @@ def stage() -> Iterator[LockstepStage]:
 
 
 @pytest.mark.parametrize("fault", [f for f in SCRIPT if f.where != "real"], ids=lambda fault: fault.name)
-def test_each_fault_is_flagged_said_once_and_survived_without_a_restart(
-    stage: LockstepStage, fault: Fault
-) -> None:
+def test_each_fault_is_flagged_said_once_and_survived_without_a_restart(stage, fault):
     stage.settle()
     stage.play(fault)
 
 
 @pytest.mark.slow
-def test_a_short_soak_in_real_time_ends_well_and_with_as_many_threads() -> None:
+def test_a_short_soak_in_real_time_ends_well_and_with_as_many_threads():
     options = Namespace(seconds=20.0, seed=7, lockstep=False, two=0.0, recount=0.0)
     result = Soak(options).run()
     assert result["faults"] >= 1  # how many fit into the time depends on the machine

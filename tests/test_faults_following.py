@@ -61,27 +61,27 @@ class Follower:
         return {(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(answered)}
 
 
-def test_a_counter_that_jumps_is_counted_and_said_and_shifts_nothing() -> None:
-    follower = Follower()
+@pytest.fixture
+def follower(monkeypatch: pytest.MonkeyPatch) -> Follower:
+    made = Follower()
+    monkeypatch.setattr(time, "monotonic_ns", lambda: made.stamp_ns)
+    return made
+
+
+def test_a_counter_that_jumps_is_said_and_syncs_that_are_left_out_are_a_gap_of_whole_periods(follower):
     follower.syncs(100)
     follower.counter += 3
     follower.syncs(100)
     assert follower.steps() == {(1, 1.0)}
     assert follower.run.loop.counter_jumps == 1
     assert follower.events == ["the SYNC counter jumped, 1 times so far"]
-
-
-def test_syncs_that_are_left_out_are_a_gap_of_whole_periods() -> None:
-    follower = Follower()
-    follower.syncs(100)
     follower.stamp_ns += 5 * PERIOD_NS
     follower.counter += 5
     follower.syncs(100)
     assert follower.steps() == {(1, 1.0), (6, 1.0)}  # these slaves count SYNCs, not time
 
 
-def test_a_second_masters_sync_spoils_its_cycle_only() -> None:
-    follower = Follower()
+def test_a_second_masters_sync_spoils_its_cycle_only(follower):
     follower.syncs(100)
     follower.run.bus.sync(follower.stamp_ns + PERIOD_NS // 4)
     follower.run.loop.receive()
@@ -93,11 +93,8 @@ def test_a_second_masters_sync_spoils_its_cycle_only() -> None:
 
 
 @pytest.mark.parametrize("most", [0.25, 0.5])
-def test_one_master_that_jitters_by_up_to_half_a_period_is_one_master(
-    most: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    follower, draw = Follower(), random.Random(7)
-    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
+def test_one_master_that_jitters_by_up_to_half_a_period_is_one_master(most, follower):
+    draw = random.Random(7)
     follower.jittering(100, lambda: 0.0)
     follower.jittering(5000, lambda: draw.uniform(-most, most))
     assert follower.run.loop.foreign_syncs <= 1
@@ -109,11 +106,7 @@ def test_one_master_that_jitters_by_up_to_half_a_period_is_one_master(
     assert follower.found[-1][0] == pytest.approx(5099, abs=1)  # the numbers keep to time
 
 
-def test_a_master_that_stalls_and_catches_up_in_a_burst_is_no_second_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    follower = Follower()
-    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
+def test_a_master_that_stalls_and_catches_up_in_a_burst_is_no_second_one(follower):
     late = itertools.chain.from_iterable(
         itertools.repeat([0.0] * 488 + [max(0.0, 12 - k * 0.95) for k in range(12)])
     )
@@ -125,9 +118,7 @@ def test_a_master_that_stalls_and_catches_up_in_a_burst_is_no_second_one(
     assert all(len(ticks) == 1 for _, _, ticks in follower.found)  # never two SYNCs in one sample
 
 
-def test_a_second_master_is_named_when_following_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    follower = Follower()
-    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
+def test_a_second_master_is_named_when_following_too(follower):
     follower.jittering(200, lambda: 0.0)
     for _ in range(100):
         follower.jittering(1, lambda: 0.0)
@@ -139,11 +130,7 @@ def test_a_second_master_is_named_when_following_too(monkeypatch: pytest.MonkeyP
     assert follower.periods == []
 
 
-def test_a_master_that_changes_its_period_is_named_with_both_and_followed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    follower = Follower()
-    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
+def test_a_master_that_changes_its_period_is_named_with_both_and_followed(follower):
     follower.jittering(1500, lambda: 0.0)
     assert follower.run.supervisor.bus.sync_period_s == 0.001
     follower.jittering(2500, lambda: 0.0, 1.5 * PERIOD_NS)
@@ -154,11 +141,8 @@ def test_a_master_that_changes_its_period_is_named_with_both_and_followed(
     assert "SYNC comes every 1 ms again" in follower.events
 
 
-def test_a_master_that_goes_on_from_where_it_was_late_is_no_second_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    follower, draw, late = Follower(), random.Random(5), 0.0
-    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
+def test_a_master_that_goes_on_from_where_it_was_late_is_no_second_one(follower):
+    draw, late = random.Random(5), 0.0
 
     def walk() -> float:  # as the kernel's broadcast manager does it
         nonlocal late

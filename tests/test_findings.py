@@ -34,26 +34,23 @@ def outcome(*effects: Finding, advice: tuple[str, ...] = ()) -> Diagnosis:
     )  # fmt: skip
 
 
+TWIN = {"alternatives": ("motor_inertia",), "alternative_probabilities": (0.4,)}
+
+
 @pytest.mark.parametrize(
     ("effects", "said"),
     [
-        ((finding("cogging", 0.9),), "The model lacks cogging (motor): "),
-        (
-            (finding("cogging", 0.46, alternatives=("motor_inertia",), alternative_probabilities=(0.4,)),),
-            "Most likely the model lacks cogging (motor) (0.46), else motor inertia (0.40): ",
-        ),
-        ((finding("cogging", 0.2),), "Something at the motor has no likely name yet (move faster): "),
-        (
-            (finding("cogging", 0.95), finding("motor_inertia", 0.5)),
-            "The model lacks cogging (motor); most likely motor inertia (motor) (0.50): ",
-        ),
+        ([finding("cogging", 0.9)], "The model lacks cogging (motor): "),
+        ([finding("cogging", 0.46, **TWIN)], "Most likely the model lacks cogging (motor) (0.46), else motor inertia (0.40): "),
+        ([finding("cogging", 0.2)], "Something at the motor has no likely name yet (move faster): "),
+        ([finding("cogging", 0.95), finding("motor_inertia", 0.5)], "The model lacks cogging (motor); most likely motor inertia (motor) (0.50): "),
     ],
-)
-def test_an_effect_is_said_as_surely_as_it_is_known(effects: tuple[Finding, ...], said: str) -> None:
+)  # fmt: skip
+def test_an_effect_is_said_as_surely_as_it_is_known(effects, said):
     assert sentence(outcome(*effects, advice=("move faster",))).startswith(said)
 
 
-def test_a_free_curve_that_raises_the_error_is_not_said_to_explain_it() -> None:
+def test_a_free_curve_that_raises_the_error_is_not_said_to_explain_it():
     unlisted = finding("unlisted", 1.0, coordinates=("position", "torque"))
     worse = replace(outcome(unlisted), verdict="unexplained", validation=Errors(1.0, 3.0, 0.82, 2.47))
     assert sentence(worse).endswith(
@@ -61,16 +58,9 @@ def test_a_free_curve_that_raises_the_error_is_not_said_to_explain_it() -> None:
     )
 
 
-@pytest.fixture(scope="module")
-def healthy() -> tuple[Record, Record]:
+def test_a_second_healthy_recording_has_no_finding():
     first, second = (kit.World([{}], seed=seed).run()[0] for seed in (31, 32))
-    return first, second
-
-
-def test_a_second_healthy_recording_has_no_finding(healthy: tuple[Record, Record]) -> None:
-    first, second = healthy
-    fitted = identify(first, kit.model()).model
-    assert diagnose(second, fitted).verdict == "sufficient"
+    assert diagnose(second, identify(first, kit.model()).model).verdict == "sufficient"
 
 
 @pytest.mark.parametrize(
@@ -83,8 +73,8 @@ def test_a_second_healthy_recording_has_no_finding(healthy: tuple[Record, Record
     ],
 )
 def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
-    before: list[float], after: list[float], confirmed: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    before, after, confirmed, monkeypatch
+):
     monkeypatch.setattr(Held, "squared", lambda _, one: float(np.mean(one.squares)))
     monkeypatch.setattr(Held, "scores", lambda _, one, among: -0.5 * np.log(one.squares))
     monkeypatch.setattr(Held, "_least", lambda *_: np.array([4e-4]))
@@ -97,7 +87,7 @@ def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
 
 
 @pytest.mark.parametrize("speed", [0.0, 2.0])
-def test_a_one_way_motion_has_no_free_curve_over_time(speed: float) -> None:
+def test_a_one_way_motion_has_no_free_curve_over_time(speed):
     time = np.arange(8000) * kit.PERIOD_S
     motion = speed * time + 0.2 * np.sin(2.0 * time) + 0.05 * np.sin(9.0 * time)
     record = Record(
@@ -113,7 +103,7 @@ def test_a_one_way_motion_has_no_free_curve_over_time(speed: float) -> None:
     assert bool(over_time) is (speed == 0.0)
 
 
-def test_of_the_motors_dry_friction_there_is_one_law() -> None:
+def test_of_the_motors_dry_friction_there_is_one_law():
     rubbing = kit.World([{"coulomb_nm": 0.4}], seed=31, seconds=8.0).run()
     search = Search(Problem(rubbing, kit.model(), 15.0))
     dry = [e.candidate for e in search._library if e.candidate.rubs]

@@ -22,6 +22,7 @@ from estimator.identify import identify
 
 ROOT = Path(__file__).resolve().parents[1]
 KUKA = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data")) / "kuka_kr300"
+JOINT = f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\n[motor.transmission]\nmodel = "linear"\n'
 LATE_S = 0.0012
 ZEROS_RAD = (0.004, -0.003)
 FRICTION_NM = (0.0, 0.3)
@@ -37,7 +38,7 @@ def runs() -> list[Record]:
     return made
 
 
-def test_machine_is_shared_and_runs_keep_their_own(runs: list[Record]) -> None:
+def test_machine_is_shared_and_runs_keep_their_own(runs):
     model = kit.model(error=0.01, linked=False)
     both = identify(runs, model)
     (one,) = both.fits
@@ -57,7 +58,7 @@ def test_machine_is_shared_and_runs_keep_their_own(runs: list[Record]) -> None:
 
 
 @pytest.mark.slow
-def test_a_zero_that_all_recordings_share_is_written() -> None:
+def test_a_zero_that_all_recordings_share_is_written():
     rig = {"zero_rad": ZEROS_RAD[0]}
     runs = [kit.World([rig], seed=seed).run()[0] for seed in (7, 8)]
     found = identify(runs, kit.model(error=0.01, linked=False))
@@ -67,7 +68,7 @@ def test_a_zero_that_all_recordings_share_is_written() -> None:
 
 
 @pytest.mark.slow
-def test_each_recording_is_validated_by_the_others(runs: list[Record]) -> None:
+def test_each_recording_is_validated_by_the_others(runs):
     model = kit.model(error=0.01, linked=False)
     found = identify([*runs, kit.World([{"late_s": LATE_S}], seed=9).run()[0]], model)
     for one in found.recordings:
@@ -80,16 +81,12 @@ def test_each_recording_is_validated_by_the_others(runs: list[Record]) -> None:
     assert last.validation.relative > 3.0 * found.recordings[-1].validation.relative  # type: ignore[union-attr]
 
 
-def test_the_command_takes_several_and_says_how_each_does(
-    runs: list[Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_takes_several_and_says_how_each_does(runs, tmp_path, capsys):
     paths = [tmp_path / name for name in ("monday.csv", "tuesday.csv")]
     for run, path in zip(runs, paths, strict=True):
         joints.write_csv(run, path)
     joint, target = tmp_path / "joint.toml", tmp_path / "written.toml"
-    joint.write_text(
-        f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\n[motor.transmission]\nmodel = "linear"\n'
-    )
+    joint.write_text(JOINT)
     asked = ["fit", *map(str, paths), "--joint", str(joint), "--out", str(tmp_path), "--write", str(target)]
     assert main(asked) == 0
     said = capsys.readouterr().out
@@ -101,29 +98,17 @@ def test_the_command_takes_several_and_says_how_each_does(
     assert written["motor"][0]["transmission"]["parameters"] == document["transmissions"][0]["parameters"]
     assert written["provenance"]["fit"]["recording"] == "monday.csv, tuesday.csv"
     assert len(written["provenance"]["floor"]["residual_nm"]) == 1
-
-
-def test_a_recording_in_degrees_among_others_is_named(
-    runs: list[Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    # One in degrees among others is named.
     assert runs[1].link_position_rad is not None
     wrong = replace(
         runs[1],
         motor_position_rad=np.degrees(runs[1].motor_position_rad),
         link_position_rad=np.degrees(runs[1].link_position_rad),
     )
-    for run, name in ((runs[0], "right"), (wrong, "wrong")):
-        joints.write_csv(run, tmp_path / f"{name}.csv")
-    joint = tmp_path / "joint.toml"
-    joint.write_text(
-        f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\n[motor.transmission]\nmodel = "linear"\n'
-    )
-    paths = [str(tmp_path / f"{name}.csv") for name in ("right", "wrong")]
-    assert main(["fit", *paths, "--joint", str(joint), "--strict"]) == 3
+    joints.write_csv(wrong, paths[1])
+    assert main(["fit", *map(str, paths), "--joint", str(joint), "--strict"]) == 3
     error = capsys.readouterr().err
-    assert "wrong.csv" in error
-    assert "right.csv" not in error
-    assert "degrees" in error
+    assert "tuesday.csv" in error and "monday.csv" not in error and "degrees" in error
 
 
 ARM = LinkDynamics(inertia_kg_m2=0.4, viscous_damping_nm_s_rad=0.1, gravity_nm=6.0, gravity_phase_rad=0.3)
@@ -164,7 +149,7 @@ def arm() -> Record:
 
 
 @pytest.mark.parametrize("gravity_nm", [0.0, 4.0])
-def test_gravity_and_friction_of_a_joint_with_one_encoder(arm: Record, gravity_nm: float) -> None:
+def test_gravity_and_friction_of_a_joint_with_one_encoder(arm, gravity_nm):
     link = replace(ARM, gravity_nm=gravity_nm, gravity_phase_rad=0.0)
     motor = Motor(inertia_kg_m2=ROTOR, viscous_damping_nm_s_rad=0.6, transmission=Transmission(model="none"))
     found = identify(arm, JointModel(arrangement="single", motors=(motor,), link=link))
@@ -184,8 +169,8 @@ def test_gravity_and_friction_of_a_joint_with_one_encoder(arm: Record, gravity_n
 
 
 def test_what_is_written_of_a_joint_with_one_encoder_is_what_is_printed_and_fitted_again_it_stays(
-    arm: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    arm, tmp_path, capsys
+):
     joints.write_csv(arm, tmp_path / "arm.csv")
     joint, target = tmp_path / "arm.toml", tmp_path / "written.toml"
     joint.write_text(
@@ -212,7 +197,7 @@ def test_what_is_written_of_a_joint_with_one_encoder_is_what_is_printed_and_fitt
 
 @pytest.mark.skipif(not KUKA.exists(), reason=f"no measured data in {KUKA} (see $DRIVELINK_DATA)")
 @pytest.mark.parametrize("axis", [2, 3])
-def test_two_recordings_of_a_robot_find_its_delay_and_one_stiffness(axis: int) -> None:
+def test_two_recordings_of_a_robot_find_its_delay_and_one_stiffness(axis):
     """The authors regress 2.6 to 2.9 ms of skew between the encoders of these axes."""
     declared = jointfile.load(ROOT / "examples" / f"kuka_axis{axis}.toml")
     records = [recording.read(KUKA / f"axis{axis}_{run}.csv", declared) for run in "AB"]

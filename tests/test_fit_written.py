@@ -130,9 +130,7 @@ def _same(printed: list[tuple[str, str]], written: dict[str, float]) -> None:
         ),
     ],
 )
-def test_what_is_printed_is_what_is_written(
-    model: str, link: str, run: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_printed_is_what_is_written(model, link, run, folder, capsys):
     (folder / "joint.toml").write_text(ONE.format(model=model) + link)
     written, document, tables = _fit(folder, run, "joint.toml", capsys)
     (motor,) = written["motor"]
@@ -157,35 +155,21 @@ def test_what_is_printed_is_what_is_written(
         assert len(tables) == 1
 
 
-def test_both_motors_of_a_pair_are_written_as_printed(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    written, document, tables = _fit(folder, "pair", "pair.toml", capsys)
+@pytest.mark.parametrize("name", ["pair", "rigid"])
+def test_both_motors_of_a_pair_and_a_rigid_joint_are_written_as_printed(name, folder, capsys):
+    written, document, tables = _fit(folder, name, f"{name}.toml", capsys)
     for table, motor, entry in zip(tables, written["motor"], document["transmissions"], strict=False):
         _same(table, _of_motor(motor))
-        assert entry["parameters"] == motor["transmission"]["parameters"]
+        assert entry["parameters"] == motor["transmission"].get("parameters", {})
+        own = {key: entry["motor"][key] for key in ("inertia_kg_m2", "viscous_damping_nm_s_rad")}
+        assert own == dict(_numbers(motor))
         assert entry.get("effects", []) == motor.get("effect", [])
 
 
-def test_a_rigid_joint_is_written_as_printed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    written, document, (table,) = _fit(folder, "rigid", "rigid.toml", capsys)
-    (motor,) = written["motor"]
-    _same(table, _of_motor(motor))
-    (entry,) = document["transmissions"]
-    assert {k: entry["motor"][k] for k in ("inertia_kg_m2", "viscous_damping_nm_s_rad")} == dict(
-        _numbers(motor)
-    )
-    assert entry.get("effects", []) == motor.get("effect", [])
-
-
 @pytest.mark.parametrize(
-    "link",
-    [pytest.param("", marks=pytest.mark.slow), LINK],
-    ids=["no link dynamics", "link dynamics"],
+    "link", [pytest.param("", marks=pytest.mark.slow), LINK], ids=["no link dynamics", "link dynamics"]
 )
-def test_skew_and_zero_of_the_readings_are_written_and_fitted_again_they_stay(
-    link: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_skew_and_zero_of_the_readings_are_written_and_fitted_again_they_stay(link, folder, capsys):
     (folder / "joint.toml").write_text(ONE.format(model="linear") + link)
     written, first, _ = _fit(folder, "skewed", "joint.toml", capsys)
     # Encoders round down: half of their steps is part of the zero that is read.
@@ -214,7 +198,7 @@ def test_skew_and_zero_of_the_readings_are_written_and_fitted_again_they_stay(
         ("[[-1.0, 0.0], [0.0, 1.0]]", "variances of 0 or more"),
     ],
 )
-def test_a_covariance_of_another_shape_is_refused(covariance: str, expected: str) -> None:
+def test_a_covariance_of_another_shape_is_refused(covariance, expected):
     text = ONE.format(model="vsa-ii") + "parameters = {{ k_nm_rad = 500.0, c = 1.7 }}\ncovariance = {}\n"
     good = jointfile.parse(text.format("[[4.0, 0.01], [0.01, 0.0025]]")).model()
     assert good.motors[0].transmission.covariance == ((4.0, 0.01), (0.01, 0.0025))
@@ -225,7 +209,7 @@ def test_a_covariance_of_another_shape_is_refused(covariance: str, expected: str
 @pytest.mark.skipif(not KUKA.exists(), reason=f"no measured data in {KUKA} (see $DRIVELINK_DATA)")
 @pytest.mark.parametrize("axis", [2, 3])
 @pytest.mark.parametrize("run", ["A", "B"])
-def test_on_a_machine_no_zero_is_written_that_spoils_the_balance(axis: int, run: str) -> None:
+def test_on_a_machine_no_zero_is_written_that_spoils_the_balance(axis, run):
     joint = jointfile.load(ROOT / "examples" / f"kuka_axis{axis}.toml")
     record = recording.read(KUKA / f"axis{axis}_{run}.csv", joint)
     found = identify(record, joint.model())
@@ -236,7 +220,7 @@ def test_on_a_machine_no_zero_is_written_that_spoils_the_balance(axis: int, run:
 
 @pytest.mark.skipif(not KUKA.exists(), reason=f"no measured data in {KUKA} (see $DRIVELINK_DATA)")
 @pytest.mark.parametrize("run", ["A", "B"])
-def test_on_a_machine_the_fitted_file_makes_its_recordings_valid(run: str, tmp_path: Path) -> None:
+def test_on_a_machine_the_fitted_file_makes_its_recordings_valid(run, tmp_path):
     """The balance leaves a sixth of the torque there: what the fit has left is what is foreseen."""
     example = ROOT / "examples" / "kuka_axis3.toml"
     written, source = tmp_path / "fitted.toml", KUKA / f"axis3_{run}.csv"

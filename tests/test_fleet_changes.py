@@ -19,7 +19,7 @@ def series(rng: np.random.Generator, change: FloatArray | float = 0.0) -> FloatA
     return np.asarray(1.0 + change + SCATTER * rng.standard_normal(NIGHTS))
 
 
-def test_a_fleet_without_changes_has_no_discovery_beyond_the_declared_rate() -> None:
+def test_a_fleet_without_changes_has_no_discovery_beyond_the_declared_rate():
     rng = np.random.default_rng(1)
     p = np.array([series_test(TIME_S, series(rng), STATED).p_value for _ in range(400)])
     # Bonferroni's bound: at most 5 % below 0.05. Binomial, 400 draws: 8.6 % is 3.3 sigma above.
@@ -27,14 +27,14 @@ def test_a_fleet_without_changes_has_no_discovery_beyond_the_declared_rate() -> 
     assert not np.any(q_values(p) <= 0.05)
 
 
-def test_a_drift_of_three_per_cent_is_found_in_nearly_all() -> None:
+def test_a_drift_of_three_per_cent_is_found_in_nearly_all():
     rng = np.random.default_rng(2)
     drift = -0.03 * TIME_S / TIME_S[-1]
     hits = [series_test(TIME_S, series(rng, drift), STATED).p_value < 1e-3 for _ in range(200)]
     assert np.mean(hits) >= 0.95
 
 
-def test_a_step_is_dated_and_its_size_lies_in_its_interval() -> None:
+def test_a_step_is_dated_and_its_size_lies_in_its_interval():
     rng = np.random.default_rng(3)
     inside = []
     for _ in range(100):
@@ -46,28 +46,22 @@ def test_a_step_is_dated_and_its_size_lies_in_its_interval() -> None:
     assert np.mean(inside) > 0.87  # 95 %, three sigma of 100 draws below
 
 
-def test_a_drift_that_begins_later_is_dated() -> None:
-    rng = np.random.default_rng(4)
-    (found,) = changes(TIME_S, series(rng, 0.06 * np.maximum(np.arange(NIGHTS) - 10, 0) / 14), STATED, 1e-3)
-    assert found.kind == "drift"
-    assert found.earliest <= 10 <= found.latest
-
-
-def test_two_steps_are_two_changes() -> None:
-    rng = np.random.default_rng(5)
-    night = np.arange(NIGHTS)
-    found = changes(TIME_S, series(rng, 0.05 * (night >= 8) - 0.1 * (night >= 17)), STATED, 1e-3)
-    assert [(one.kind, one.first) for one in found] == [("step", 8), ("step", 17)]
+def test_a_drift_that_begins_later_and_two_steps_are_dated():
+    rng, night = np.random.default_rng(4), np.arange(NIGHTS)
+    (found,) = changes(TIME_S, series(rng, 0.06 * np.maximum(night - 10, 0) / 14), STATED, 1e-3)
+    assert found.kind == "drift" and found.earliest <= 10 <= found.latest
+    both = changes(TIME_S, series(rng, 0.05 * (night >= 8) - 0.1 * (night >= 17)), STATED, 1e-3)
+    assert [(one.kind, one.first) for one in both] == [("step", 8), ("step", 17)]
 
 
 @pytest.mark.parametrize("night", [0, 12, NIGHTS - 1])
-def test_one_odd_recording_is_no_change(night: int) -> None:
+def test_one_odd_recording_is_no_change(night):
     value = series(np.random.default_rng(6))
     value[night] += 20.0 * SCATTER
     assert series_test(TIME_S, value, STATED).p_value > 0.05
 
 
-def test_nights_that_resemble_each_other_are_not_taken_for_a_trend() -> None:
+def test_nights_that_resemble_each_other_are_not_taken_for_a_trend():
     rng, p = np.random.default_rng(7), []
     for _ in range(500):
         noise = rng.standard_normal(NIGHTS)
@@ -77,22 +71,16 @@ def test_nights_that_resemble_each_other_are_not_taken_for_a_trend() -> None:
     assert np.mean(np.array(p) < 0.05) < 0.08  # binomial, 500 draws: three sigma above 5 %
 
 
-def test_too_few_recordings_decide_nothing() -> None:
-    few = LEAST - 1
-    assert series_test(TIME_S[:few], np.linspace(1.0, 2.0, few), STATED[:few]).p_value == 1.0
-    assert changes(TIME_S[:few], np.linspace(1.0, 2.0, few), STATED[:few], 0.05) == []
-
-
-def test_a_series_without_any_scatter_is_steady_and_one_that_steps_is_not() -> None:
+def test_too_few_recordings_none_that_scatter_and_some_of_one_moment():
+    few, rising = LEAST - 1, np.linspace(1.0, 1.2, NIGHTS)
+    assert series_test(TIME_S[:few], rising[:few], STATED[:few]).p_value == 1.0
+    assert changes(TIME_S[:few], rising[:few], STATED[:few], 0.05) == []
     assert series_test(TIME_S, np.ones(NIGHTS), np.zeros(NIGHTS)).p_value == 1.0
     assert series_test(TIME_S, 1.0 + (TIME_S[9] <= TIME_S), np.zeros(NIGHTS)).p_value < 1e-6
+    assert series_test(np.zeros(NIGHTS), rising, STATED).p_value < 1e-6  # taken in order
 
 
-def test_recordings_of_one_moment_are_taken_in_order() -> None:
-    assert series_test(np.zeros(NIGHTS), np.linspace(1.0, 1.2, NIGHTS), STATED).p_value < 1e-6
-
-
-def test_an_effect_that_appears_is_dated_and_one_that_comes_and_goes_is_not_significant() -> None:
+def test_an_effect_that_appears_is_dated_and_one_that_comes_and_goes_is_not_significant():
     appeared = appearance(np.arange(NIGHTS) >= 14)
     assert appeared.first == 14
     assert appeared.p_value < 1e-4
@@ -101,7 +89,7 @@ def test_an_effect_that_appears_is_dated_and_one_that_comes_and_goes_is_not_sign
     assert appearance(np.arange(NIGHTS) < 10).p_value == 1.0  # it went away
 
 
-def test_q_values_are_those_of_benjamini_and_hochberg() -> None:
+def test_q_values_are_those_of_benjamini_and_hochberg():
     """By hand: p · n / rank from the largest down, never rising."""
     p = np.array([0.01, 0.04, 0.03, 0.005])
     assert q_values(p) == pytest.approx([0.02, 0.04, 0.04, 0.02])

@@ -2,7 +2,6 @@
 
 import logging
 import math
-from collections.abc import Iterator
 
 import pytest
 from fuzzrun import FuzzRun
@@ -11,7 +10,7 @@ from estimator.sample import Status
 
 
 @pytest.fixture(autouse=True)
-def quiet() -> Iterator[None]:
+def quiet():
     logging.disable(logging.CRITICAL)
     yield
     logging.disable(logging.NOTSET)
@@ -20,33 +19,29 @@ def quiet() -> Iterator[None]:
 @pytest.mark.parametrize(
     "seed", [101, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (102, 103, 104))]
 )
-def test_whatever_wires_and_confused_nodes_do_what_is_valid_is_of_its_sync(seed: int) -> None:
+def test_whatever_wires_and_confused_nodes_do_what_is_valid_is_of_its_sync(seed):
     run = FuzzRun(seed)
-    run.run(100_000 if seed == 101 else 200_000)
+    run.run(60_000 if seed == 101 else 200_000)
     print(run.summary())
     # The fuzz must leave enough to be judged, and forged frames that fit must stay the exception they are.
     assert run.judge.valid > 0.15 * run.loop.cycles
     assert run.judge.unknowable < 0.01 * run.judge.valid
 
 
-@pytest.mark.parametrize("seed", [201, pytest.param(202, marks=pytest.mark.slow)])
-def test_forged_answers_to_the_configuration_raise_nothing(seed: int) -> None:
-    run = FuzzRun(seed, hostile=True)
-    run.run(50_000)
+@pytest.mark.parametrize(
+    ("seed", "how"),
+    [(201, "hostile"), pytest.param(202, "hostile", marks=pytest.mark.slow), (301, "passive")],
+)
+def test_forged_answers_to_the_configuration_raise_nothing_and_a_passive_daemon_sends_nothing(seed, how):
+    run = FuzzRun(seed, **{how: True})
+    run.run(25_000)
     print(run.summary())
     assert run.judge.samples
 
 
-def test_a_passive_daemon_fuzzed_raises_nothing_and_sends_nothing() -> None:
-    run = FuzzRun(301, passive=True)
-    run.run(50_000)
-    print(run.summary())
-    assert run.judge.samples
-
-
-def test_the_real_estimator_comes_out_of_it_with_finite_values() -> None:
+def test_the_real_estimator_comes_out_of_it_with_finite_values():
     run = FuzzRun(401, real=True)
-    run.run(40_000)
+    run.run(20_000)
     print(run.summary())
     assert run.judge.samples
     run.bus.rate = 0.0
@@ -58,7 +53,7 @@ def test_the_real_estimator_comes_out_of_it_with_finite_values() -> None:
     assert math.isfinite(estimate.flexibility_torque_nm + estimate.stiffness_nm_rad)
 
 
-def test_after_all_that_a_calm_bus_gives_valid_estimates_again() -> None:
+def test_after_all_that_a_calm_bus_gives_valid_estimates_again():
     run = FuzzRun(501)
     layouts = dict(run.configurator.layouts)
     run.run(20_000)

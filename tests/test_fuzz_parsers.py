@@ -2,7 +2,6 @@
 
 import logging
 import random
-from pathlib import Path
 
 import pytest
 from fuzzparsers import CORPUS, PARSERS, damaged, seeds, take
@@ -10,9 +9,7 @@ from fuzzparsers import CORPUS, PARSERS, damaged, seeds, take
 
 @pytest.mark.parametrize("times", [25, pytest.param(400, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
 @pytest.mark.parametrize("parser", PARSERS)
-def test_damaged_inputs_are_read_or_refused_in_one_line(
-    parser: str, times: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damaged_inputs_are_read_or_refused_in_one_line(parser, times, tmp_path, caplog):
     caplog.set_level(logging.CRITICAL)
     for path in sorted((CORPUS / parser).glob("*")):
         take(parser, path.read_bytes(), tmp_path)

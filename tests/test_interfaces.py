@@ -5,25 +5,22 @@ import pty
 import socket
 import threading
 import tty
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import can
 import pytest
-from daemonkit import running, vsa
+from daemonkit import running, served, vsa
+from test_cli_run import free_port
 from zenohkit import until
 
 from drivelink._core import JointPipeline
 from drivelink.canopen.bus import open_bus
 from drivelink.cycle.sources import BusLostError, open_source
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simbus import open_sim_bus
-from drivelink.demo.simulate import network_from_joint
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
 from estimator.sample import Status
-from sim.network import Network
 
 PERIOD_S = 0.01
 
@@ -96,18 +93,6 @@ def joint_on(interface: str, channel: str, options: str, more: str = "") -> Join
     return vsa(channel=channel, bus=bus)
 
 
-@contextmanager
-def devices(joint: JointFile) -> Iterator[Network]:
-    bus = open_sim_bus(joint.bus)
-    network = network_from_joint(joint, bus)
-    network.start()
-    try:
-        yield network
-    finally:
-        network.stop()
-        bus.shutdown()
-
-
 def is_fresh(pipeline: JointPipeline) -> bool:
     """Whether the last estimate is of frames that came in its cycle; valid it is only on a machine that keeps time."""
     return pipeline.estimate is not None and not pipeline.estimate.status & Status.STALE
@@ -117,12 +102,12 @@ def lost(daemon: Daemon) -> bool:
     return "bus" in daemon.events.active
 
 
-def test_a_joint_behind_a_serial_adapter_that_is_pulled_out_and_put_in(tmp_path: Path) -> None:
+def test_a_joint_behind_a_serial_adapter_that_is_pulled_out_and_put_in(tmp_path):
     behind = vsa(bus=f"period_s = {PERIOD_S}")
     joint = joint_on("slcan", str(tmp_path / "ttyCAN"), "sleep_after_open = 0.0")
     adapter = SerialAdapter(tmp_path / "ttyCAN", behind.bus.channel)
     try:
-        with devices(behind):
+        with served(behind):
             daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
             pipeline = daemon.pipelines[0]
             with running(daemon):
@@ -138,7 +123,7 @@ def test_a_joint_behind_a_serial_adapter_that_is_pulled_out_and_put_in(tmp_path:
         adapter.close()
 
 
-def test_a_passive_serial_adapter_is_opened_listen_only_at_its_bit_rate(tmp_path: Path) -> None:
+def test_a_passive_serial_adapter_is_opened_listen_only_at_its_bit_rate(tmp_path):
     adapter = SerialAdapter(tmp_path / "ttyCAN", "passive")
     more = 'bitrate = 500_000\nconfigure = false\nsync = "follow"'
     open_bus(joint_on("slcan", str(tmp_path / "ttyCAN"), "sleep_after_open = 0.0", more).bus).shutdown()
@@ -146,76 +131,49 @@ def test_a_passive_serial_adapter_is_opened_listen_only_at_its_bit_rate(tmp_path
     adapter.close()
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
-def test_a_socketcand_server_that_goes_and_comes_back() -> None:
+def test_a_socketcand_server_that_goes_and_comes_back_and_a_second_daemon_that_is_refused():
     joint = joint_on("socketcand", "can0", f'host = "127.0.0.1", port = {free_port()}')
-    with devices(joint):
-        daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
-        pipeline = daemon.pipelines[0]
-        thread = running(daemon)
-        thread.__enter__()
-        until(lambda: is_fresh(pipeline))
-    try:
+    with ExitStack() as stack:
+        with served(joint):
+            bus = open_bus(joint.bus)  # a listener
+            stack.callback(bus.shutdown)
+            source = open_source(bus)
+            source.wait(0.01)
+            daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
+            pipeline = daemon.pipelines[0]
+            stack.enter_context(running(daemon))
+            until(lambda: is_fresh(pipeline))
+            reboots = [c.reboots for c in pipeline.assembler.counters.values()]
+            with pytest.raises(BusError, match="another master already produces SYNC"):
+                other = joint.model_copy(update={"name": "other"})
+                Daemon([ServedJoint(joint=other)], publish=False, real_time=False)
+            assert [c.reboots for c in pipeline.assembler.counters.values()] == reboots
+            assert not any("configured again" in e["text"] for e in daemon.events.recent())
         until(lambda: lost(daemon))
         until(lambda: not is_fresh(pipeline))
-        with devices(joint):
-            until(lambda: is_fresh(pipeline))
-            assert not lost(daemon)
-    finally:
-        thread.__exit__(None, None, None)
-
-
-def test_a_listener_too_notices_that_a_socketcand_server_is_gone() -> None:
-    joint = joint_on("socketcand", "can0", f'host = "127.0.0.1", port = {free_port()}')
-    with devices(joint):
-        bus = open_bus(joint.bus)
-        source = open_source(bus)
-        source.wait(0.01)
-    try:
         with pytest.raises(BusLostError, match="closed"):
-            for _ in range(100):  # python-can itself would say for ever that there is nothing
+            while True:  # python-can itself would say for ever that there is nothing
                 source.wait(0.01)
                 source.take()
-    finally:
-        bus.shutdown()
+        with served(joint):
+            until(lambda: is_fresh(pipeline))
+            assert not lost(daemon)
 
 
-def test_error_frames_of_any_interface_are_counted_by_kind() -> None:
+def test_error_frames_of_any_interface_are_counted_by_kind():
     section = BusSection(channel="error-frames")
     with can.Bus(interface="virtual", channel="error-frames") as other, open_bus(section) as bus:
-        source = open_source(bus)
+        source, frame = open_source(bus), {"data": b"\0\1", "is_error_frame": True, "is_extended_id": False}
         for kind in (0x040, 0x100, 0x004):
-            other.send(
-                can.Message(arbitration_id=kind, data=b"\0\1", is_error_frame=True, is_extended_id=False)
-            )
+            other.send(can.Message(arbitration_id=kind, **frame))
         assert source.take() == []
         assert source.errors == {"bus-off": 1, "restarted": 1, "controller": 1, "receive overflow": 1}
-
-
-def test_a_lost_bus_is_one_line_whatever_python_can_puts_into_its_message() -> None:
+    # A lost bus is one line, whatever python-can puts into its message.
     said = "Failed to receive: [Errno 104] Connection reset by peer  Traceback (most recent call last):\n  File ...\n"
     assert str(BusLostError(said)) == "Failed to receive: [Errno 104] Connection reset by peer"
 
 
-def test_a_second_daemon_under_another_name_is_refused_on_socketcand() -> None:
-    joint = joint_on("socketcand", "can0", f'host = "127.0.0.1", port = {free_port()}')
-    with devices(joint):
-        daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
-        with running(daemon):
-            until(lambda: is_fresh(daemon.pipelines[0]))
-            other = joint.model_copy(update={"name": "other"})
-            reboots = [c.reboots for c in daemon.pipelines[0].assembler.counters.values()]
-            with pytest.raises(BusError, match="another master already produces SYNC"):
-                Daemon([ServedJoint(joint=other)], publish=False, real_time=False)
-            assert [c.reboots for c in daemon.pipelines[0].assembler.counters.values()] == reboots
-            assert not any("configured again" in e["text"] for e in daemon.events.recent())
-
-
-def test_a_socketcand_server_that_says_nothing_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_socketcand_server_that_says_nothing_is_one_line(monkeypatch):
     monkeypatch.setattr("drivelink.canopen.bus._CONNECT_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as server:
         section = BusSection(

@@ -1,19 +1,15 @@
 """The joint file: what is right is read, what is wrong is one line."""
 
 import itertools
-import logging
 import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, get_args, get_type_hints
+from typing import get_args, get_type_hints
 
 import pytest
 
 from drivelink import jointfile
-from drivelink.daemon.reload import Reloader
-from drivelink.daemon.status import EventLog
 from drivelink.errors import JointFileError
 from drivelink.jointfile import apart
 from estimator import make_estimator
@@ -54,7 +50,7 @@ prefix = "drivelink"
 """
 
 
-def test_the_contract_s_example_is_read_as_written() -> None:
+def test_the_contract_s_example_is_read_as_written():
     joint = jointfile.parse(ELBOW)
     model = joint.model()
     assert model.motors[0].inertia_kg_m2 == 0.125
@@ -72,11 +68,7 @@ def test_the_contract_s_example_is_read_as_written() -> None:
     [
         ("inertia_kg_m2 = 0.125", "inertia_kg_m2 = -1", "motor[1].inertia_kg_m2: input should be greater than 0, got -1"),
         ("inertia_kg_m2 = 0.125", "", "motor[1].inertia_kg_m2: expected this key, it is missing"),
-        (
-            "inertia_kg_m2 = 0.125",
-            "inertia_kg_m2 = nan",
-            "motor[1].inertia_kg_m2: input should be a finite number, got nan",
-        ),
+        ("inertia_kg_m2 = 0.125", "inertia_kg_m2 = nan", "motor[1].inertia_kg_m2: input should be a finite number, got nan"),
         ("order = 2", "order = 22", "motor[1].transmission: order: expected 1 to 9, got 22"),
         ("order = 2", "ordr = 2", "motor[1].transmission.ordr: unknown key, did you mean order?"),
         ("node_id = 1", 'node_id = "x"', "motor[1].drive.node_id: input should be a valid integer, got 'x'"),
@@ -89,11 +81,17 @@ def test_the_contract_s_example_is_read_as_written() -> None:
         ("[bus]", "[bus", "expected TOML"),
         ('prefix = "drivelink"', 'prefix = "a b"', "zenoh.prefix: expected parts of a zenoh key"),
         ("inertia_kg_m2 = 0.4", "inertia_kg_m2 = -0.4", "link.dynamics: inertia_kg_m2: expected a finite number > 0"),
+        # numbers beyond their range, with range and unit
+        ("damping_nm_s_rad = 0.8", "damping_nm_s_rad = 1e200", "motor[1]: viscous_damping_nm_s_rad: expected -1e+09 to 1e+09 N·m·s/rad, got 1e+200"),
+        ("= 0.125", "= 1e-300", "motor[1]: inertia_kg_m2: expected 1e-12 to 1e+09 kg·m², got 1e-300"),
+        ("torque_nm = 0.25", "torque_nm = 1e200", "motor[1].effect[1]: torque_nm: expected -1e+09 to 1e+09"),
+        ("torque_nm = 0.25", f"torque_nm = {[0.25] * 33}", "motor[1].effect[1]: torque_nm: expected at most 32 numbers, got 33"),
+        ('mode = "robust"', "bandwidth_rad_s = 1e-12", "estimator: bandwidth_rad_s: expected 0.5 to 10000 rad/s, got 1e-12"),
+        ("gravity_nm = 6", "gravity_nm = 1e11", "link.dynamics: gravity_nm: expected -1e+09 to 1e+09 N·m"),
+        ("= 0.001", "= 1e-9", "bus.period_s: input should be greater than or equal to 0.0001, got 1e-09"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_one_line_with_file_key_and_expectation(
-    right: str, wrong: str, message: str
-) -> None:
+def test_what_is_wrong_is_one_line_with_file_key_and_expectation(right, wrong, message):
     text = ELBOW.replace(right, wrong, 1)
     assert text != ELBOW
     with pytest.raises(JointFileError) as caught:
@@ -102,36 +100,15 @@ def test_what_is_wrong_is_one_line_with_file_key_and_expectation(
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(JointFileError, match=r"none\.toml: cannot be read as a joint file: No such file"):
-        jointfile.load(tmp_path / "none.toml")
-
-
-def test_a_binary_file_is_one_line(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_and_a_node_id_given_twice_are_one_line(tmp_path):
     path = tmp_path / "joint.toml"
+    with pytest.raises(JointFileError, match=r"joint\.toml: cannot be read as a joint file: No such file"):
+        jointfile.load(path)
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(JointFileError, match="expected UTF-8 text"):
         jointfile.load(path)
-
-
-def test_a_rewritten_model_keeps_everything_else_and_its_comments(tmp_path: Path) -> None:
-    source, target = tmp_path / "elbow.toml", tmp_path / "elbow2.toml"
-    source.write_text(ELBOW, encoding="utf-8")
-    changes = {
-        "motor": [
-            {
-                "transmission": {"parameters": {"coefficients_nm_rad": [100.0, 500.0]}},
-                "effect": [{"name": "cogging", "parameters": {"amplitude_nm": 0.1}}],
-            }
-        ],
-        "provenance": {"recording": "run.csv"},
-    }
-    joint = jointfile.write_model(jointfile.load_text(source), target, changes)
-    assert joint == jointfile.load(target)
-    assert joint.motor[0].transmission.parameters == {"coefficients_nm_rad": (100.0, 500.0)}
-    assert [effect.name for effect in joint.motor[0].effect] == ["cogging"]
-    assert joint.motor[0].drive == jointfile.load(source).motor[0].drive
-    assert "# part of the key expression" in target.read_text(encoding="utf-8")
+    with pytest.raises(JointFileError, match="got 1 twice"):
+        jointfile.parse(ELBOW.replace("[link.encoder]", '[link.encoder]\nsource = "cia406"\nnode_id = 1'))
 
 
 DOTTED = """\
@@ -149,13 +126,15 @@ drive.node_id = 3
 @pytest.mark.parametrize(
     "text",
     [
+        ELBOW,
         DOTTED,
         DOTTED.replace("parameters.k_nm_rad = 100.0", "parameters = { k_nm_rad = 100.0 }"),
         'name = "elbow"\nlink = { dynamics = { inertia_kg_m2 = 0.2 } }\n'
         "motor = [{ inertia_kg_m2 = 0.1, transmission = { model = 'linear' } }]\n",
     ],
+    ids=["headers", "dotted", "inline parameters", "inline"],
 )
-def test_tables_without_a_header_are_rewritten_as_well(tmp_path: Path, text: str) -> None:
+def test_a_rewritten_model_keeps_everything_else_and_its_comments(tmp_path, text):
     source, target = tmp_path / "elbow.toml", tmp_path / "elbow2.toml"
     source.write_text(text, encoding="utf-8")
     effect = {"name": "torque_offset", "parameters": {"torque_nm": 0.2}}
@@ -170,9 +149,14 @@ def test_tables_without_a_header_are_rewritten_as_well(tmp_path: Path, text: str
     assert joint.motor[0].transmission.parameters == {"k_nm_rad": 120.0}
     assert joint.link.dynamics is not None
     assert (joint.link.dynamics.inertia_kg_m2, joint.link.dynamics.gravity_nm) == (0.3, 1.0)
-    assert (len(joint.motor[0].effect), len(joint.link.effect)) == (1, 2)
+    assert [one.name for one in joint.motor[0].effect] == ["torque_offset"] and len(joint.link.effect) == 2
     assert joint.motor[0].drive == jointfile.load(source).motor[0].drive
-    assert ("# weighed" in text) == ("# weighed" in target.read_text(encoding="utf-8"))
+    for comment in ("# weighed", "# part of the key expression"):
+        assert (comment in text) == (comment in target.read_text(encoding="utf-8"))
+    target.unlink()
+    with pytest.raises(JointFileError):  # an invalid rewrite writes nothing
+        jointfile.write_model(jointfile.load_text(source), target, {"bus": {"period_s": -1.0}})
+    assert not target.exists()
 
 
 @pytest.fixture
@@ -186,7 +170,7 @@ def written(tmp_path: Path) -> Path:
     return target
 
 
-def test_no_part_of_a_written_file_is_taken_for_a_model(written: Path) -> None:
+def test_no_part_of_a_written_file_is_taken_for_a_model(written):
     whole = written.read_bytes()
     assert whole.splitlines()[-1].startswith(b"# drivelink check: sha256 ")
     for end in range(len(whole) - 1):  # without its last line end it is still whole
@@ -198,9 +182,7 @@ def test_no_part_of_a_written_file_is_taken_for_a_model(written: Path) -> None:
             assert "truncated: its last line, the check line, is missing" in str(caught.value)
 
 
-def test_a_written_file_may_be_edited_and_that_is_said(
-    written: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_written_file_may_be_edited_and_that_is_said(written, caplog):
     jointfile.load(written)
     written.write_bytes(written.read_bytes().replace(b"\n", b"\r\n"))  # by a checkout on another system
     jointfile.load(written)
@@ -208,24 +190,11 @@ def test_a_written_file_may_be_edited_and_that_is_said(
     written.write_text(written.read_text().replace("500.0", "600.0"))
     assert jointfile.load(written).motor[0].transmission.parameters["coefficients_nm_rad"] == (100.0, 600.0)
     assert caplog.messages == [f"{written}: edited since drivelink wrote it: read as it is now"]
-
-
-def test_a_copy_of_a_written_file_has_one_check_line(written: Path) -> None:
     source = jointfile.load_text(written)
-    for _ in range(2):
+    for _ in range(2):  # a copy has one check line
         jointfile.write_model(source, written, {"provenance": {"recording": "s.csv"}}, force=True)
         source = jointfile.load_text(written)
     assert source.text.count("# drivelink ") == 2 and source.joint.provenance == {"recording": "s.csv"}
-
-
-def test_the_daemon_does_not_take_a_part_of_a_joint_file_over(written: Path) -> None:
-    events = EventLog(logging.getLogger("drivelink.test"))
-    pipeline: Any = SimpleNamespace(history=None)  # never reached
-    reloader = Reloader(written, jointfile.load(written), pipeline, pipeline, pipeline, events)
-    written.write_bytes(written.read_bytes()[:-40])
-    reloader._prepare()
-    (said,) = [event["text"] for event in events.recent()]
-    assert said.startswith("the model stays as it is") and "truncated" in said
 
 
 @pytest.mark.parametrize(
@@ -241,45 +210,13 @@ def test_the_daemon_does_not_take_a_part_of_a_joint_file_over(written: Path) -> 
         ("\n".join(f"k{k} = 1" for k in range(20_000)), "(and 20001 more)"),
     ],
 )
-def test_a_joint_file_that_grows_without_end_is_one_line(tmp_path: Path, text: str, line: str) -> None:
+def test_a_joint_file_that_grows_without_end_is_one_line(tmp_path, text, line):
     path = tmp_path / "joint.toml"
     path.write_text(text)
     for read in (lambda: jointfile.load(path), lambda: jointfile.parse(text)):
         with pytest.raises(JointFileError) as caught:
             read()
         assert line in str(caught.value) and "\n" not in str(caught.value) and len(str(caught.value)) < 600
-
-
-@pytest.mark.parametrize(
-    ("right", "wrong", "message"),
-    [
-        (
-            "damping_nm_s_rad = 0.8",
-            "damping_nm_s_rad = 1e200",
-            "motor[1]: viscous_damping_nm_s_rad: expected -1e+09 to 1e+09 N·m·s/rad, got 1e+200",
-        ),
-        ("= 0.125", "= 1e-300", "motor[1]: inertia_kg_m2: expected 1e-12 to 1e+09 kg·m², got 1e-300"),
-        ("torque_nm = 0.25", "torque_nm = 1e200", "motor[1].effect[1]: torque_nm: expected -1e+09 to 1e+09"),
-        (
-            "torque_nm = 0.25",
-            f"torque_nm = {[0.25] * 33}",
-            "motor[1].effect[1]: torque_nm: expected at most 32 numbers, got 33",
-        ),
-        (
-            'mode = "robust"',
-            "bandwidth_rad_s = 1e-12",
-            "estimator: bandwidth_rad_s: expected 0.5 to 10000 rad/s, got 1e-12",
-        ),
-        ("gravity_nm = 6", "gravity_nm = 1e11", "link.dynamics: gravity_nm: expected -1e+09 to 1e+09 N·m"),
-        ("= 0.001", "= 1e-9", "bus.period_s: input should be greater than or equal to 0.0001, got 1e-09"),
-    ],
-)
-def test_a_number_beyond_its_range_is_one_line_with_range_and_unit(
-    right: str, wrong: str, message: str
-) -> None:
-    with pytest.raises(JointFileError) as caught:
-        jointfile.parse(ELBOW.replace(right, wrong, 1), "elbow.toml")
-    assert str(caught.value).startswith(f"elbow.toml: {message}") and "\n" not in str(caught.value)
 
 
 def numeric_keys(kind: type, seen: set[type]) -> Iterator[str]:
@@ -296,7 +233,7 @@ def numeric_keys(kind: type, seen: set[type]) -> Iterator[str]:
                 yield from numeric_keys(part, seen)
 
 
-def test_every_number_with_a_unit_has_a_range_of_that_unit() -> None:
+def test_every_number_with_a_unit_has_a_range_of_that_unit():
     names = set(numeric_keys(jointfile.JointFile, set()))
     names |= {parameter.name for kind in LIBRARY.values() for parameter in kind.parameters}
     assert {"bandwidth_rad_s", "period_s", "torque_nm", "inertia_kg_m2", "rated_current_a"} <= names
@@ -305,7 +242,7 @@ def test_every_number_with_a_unit_has_a_range_of_that_unit() -> None:
 
 
 @pytest.mark.parametrize("period_s", [1e-4, 1.0])
-def test_what_a_joint_file_may_say_is_prepared_in_a_moment(period_s: float) -> None:
+def test_what_a_joint_file_may_say_is_prepared_in_a_moment(period_s):
     """At the ends of every range of [estimator] the estimator has a bounded size and takes one step."""
     for name, value in itertools.product(
         ("bandwidth_rad_s", "external_bandwidth_rad_s", "k_tau_rad_s", "false_alarms_per_hour"), (0, 1)
@@ -316,9 +253,7 @@ def test_what_a_joint_file_may_say_is_prepared_in_a_moment(period_s: float) -> N
         assert made.step(Sample(0, (0.0,), (math.nan,), (0.0,), 0.0)).sequence == 0
 
 
-def test_a_running_daemon_has_a_joint_file_read_by_another_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_running_daemon_has_a_joint_file_read_by_another_process(tmp_path, monkeypatch):
     path = tmp_path / "elbow.toml"
     path.write_text(ELBOW)
     assert apart.load_apart(path) == jointfile.load(path)
@@ -331,17 +266,3 @@ def test_a_running_daemon_has_a_joint_file_read_by_another_process(
     monkeypatch.setattr(apart, "_PATIENCE_S", 1e-3)
     with pytest.raises(JointFileError, match=r"elbow\.toml: expected to be read within 0\.001 s"):
         apart.load_apart(path)
-
-
-def test_an_invalid_rewrite_writes_nothing(tmp_path: Path) -> None:
-    source, target = tmp_path / "elbow.toml", tmp_path / "elbow2.toml"
-    source.write_text(ELBOW, encoding="utf-8")
-    with pytest.raises(JointFileError):
-        jointfile.write_model(jointfile.load_text(source), target, {"bus": {"period_s": -1.0}})
-    assert not target.exists()
-
-
-def test_two_devices_with_one_node_id_are_refused() -> None:
-    text = ELBOW.replace("[link.encoder]", '[link.encoder]\nsource = "cia406"\nnode_id = 1')
-    with pytest.raises(JointFileError, match="got 1 twice"):
-        jointfile.parse(text)

@@ -30,9 +30,7 @@ def locked(file: str) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize(("file", "wanted"), [("requirements.txt", CI), ("requirements-run.txt", RUN)])
-def test_everything_that_is_asked_for_is_locked_in_a_version_that_is_asked_for(
-    file: str, wanted: list[str]
-) -> None:
+def test_everything_that_is_asked_for_is_locked_in_a_version_that_is_asked_for(file, wanted):
     versions = locked(file)
     for line in wanted:
         requirement = Requirement(line)
@@ -40,17 +38,14 @@ def test_everything_that_is_asked_for_is_locked_in_a_version_that_is_asked_for(
         assert found and all(requirement.specifier.contains(v) for v in found), f"{line}: run sh .ci/lock"
 
 
-def test_both_locks_agree() -> None:
+def test_both_locks_agree_and_name_no_place():
     every, run = locked("requirements.txt"), locked("requirements-run.txt")
     assert {name: every[name] for name in run} == run
-
-
-def test_the_lock_names_no_place() -> None:
     for file in ("requirements.txt", "requirements-run.txt"):
         assert "://" not in (ROOT / ".ci" / file).read_text(encoding="utf-8")
 
 
-def test_the_container_installs_the_lock_and_runs_the_demo() -> None:
+def test_the_container_installs_the_lock_and_runs_the_demo():
     text = (ROOT / "Containerfile").read_text(encoding="utf-8")
     assert (
         "--require-hashes -r .ci/requirements-run.txt" in text and "--no-deps --no-build-isolation ." in text

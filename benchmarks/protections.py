@@ -64,7 +64,7 @@ PROTECTIONS = [
         ("foreign pages", "monitor/web.py", 'origin not in (None, f"http://{host}")', "False", "tests/test_monitor.py"),
         ("open streams", "monitor/web.py", "in _OWN_PAGES\n        ):\n            self._events()", "in _OWN_PAGES or True\n        ):\n            self._events()", "tests/test_monitor.py"),
         ("claims of a joint", "pubsub/feed.py", "if len(self._claims) < MAX_CLAIMS:", "if True:", "tests/test_network_attacks.py -k tokens"),
-        ("messages of others", "pubsub/feed.py", "if not (free and vouched):", "if False:", "tests/test_network_attacks.py -k 'stays or first_writer'"),
+        ("messages of others", "pubsub/feed.py", "if not (free and vouched):", "if False:", "tests/test_network_attacks.py -k 'stays or who_speaks'"),
         ("valid and impossible", "pubsub/wire.py", "if message.status & _VALID and not _usable(message):", "if False:", "tests/test_wire.py"),
         ("floods of queries", "pubsub/publisher.py", "zenoh.handlers.RingChannel(_QUERIES)", "zenoh.handlers.FifoChannel(10_000)", "tests/test_publisher.py -k flood"),
         ("a scheduler with certificates", "fleet/runner.py", 'if not address.startswith("tls://") and not insecure:', "if False:", "tests/test_fleet.py -k certificates"),

@@ -11,8 +11,9 @@ import logging
 import re
 import threading
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from itertools import pairwise
+from operator import or_
 from typing import Any
 
 import can
@@ -85,23 +86,16 @@ class Truth:
         return self._physics[place] if 0 <= place < len(self._physics) else None
 
     def measured(self, sample: Sample, sync: int, late: bool) -> bool:
-        """Whether all positions of a sample are those of one SYNC.
-
-        Args:
-            sample: as published.
-            sync: number of the SYNC, from 0.
-            late: single values may be those of the SYNC before.
-        """
+        """Whether all positions of a sample are those of one SYNC (from 0); `late`: or single ones of that before."""
         place = sync - self._forgotten
         if not 0 < place < len(self._history):
             return False
-        now, before = self._history[place], self._history[place - 1]
         values = (*sample.motor_position_rad, sample.link_position_rad)
-        for mapped, value, right, old in zip(self._objects, values, now, before, strict=True):
-            count = round((value + mapped.offset) / mapped.scale)
-            if count != right and not (late and count == old):
-                return False
-        return True
+        rows = zip(self._objects, values, self._history[place], self._history[place - 1], strict=True)
+        return all(
+            (count := round((value + mapped.offset) / mapped.scale)) == now or (late and count == before)
+            for mapped, value, now, before in rows
+        )
 
 
 class Sink(Collector):
@@ -138,9 +132,7 @@ class _Said(logging.Handler):
     def __init__(self) -> None:
         super().__init__(logging.INFO)
         self.lines: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.lines.append(record.getMessage())
+        self.emit = lambda record: self.lines.append(record.getMessage())
 
 
 class Stage:
@@ -238,9 +230,8 @@ class Stage:
             self.run(0.25)
             if self.well and also():
                 return
-        document = self.document()
-        kept = {key: document[key] for key in ("state", "not_valid", "conditions", "quality", "nodes")}
-        raise AssertionError(f"not well again: {kept}")
+        document, told = self.document(), ("state", "not_valid", "conditions", "quality", "nodes")
+        raise AssertionError(f"not well again: { {key: document[key] for key in told} }")
 
     def forget(self) -> None:
         """What was published, said and measured until now is of no more interest."""
@@ -289,9 +280,8 @@ class Stage:
             assert fault.state in states, f"{fault.name}: the status only said {states}"
         after = self._counters()
         for (node, name), count in fault.counts.items():
-            self.compare(
-                f"{fault.name}: {name} of node {node}", after[node][name] - before[node][name], count
-            )
+            what = f"{fault.name}: {name} of node {node}"
+            self.compare(what, after[node][name] - before[node][name], count)
 
     def compare(self, what: str, found: int, expected: int) -> None:
         assert found >= 1, what
@@ -308,20 +298,16 @@ class Stage:
         return {node: count.as_dict() for node, count in counters.items()}
 
     def _check_flags(self, fault: Fault) -> None:
-        estimates = [estimate for estimate, _ in self.collector.estimates]
-        seen = 0
-        for estimate in estimates:
-            seen |= estimate.status
-            assert not (estimate.status & Status.STALE and estimate.status & Status.VALID), fault.name
-        assert fault.flags & ~seen == 0, (
-            f"{fault.name}: flags {Status(seen)!r}, expected {Status(fault.flags)!r}"
-        )
-        stale = sum(bool(e.status & Status.STALE) for e in estimates)
+        statuses = [(estimate.sequence, Status(estimate.status)) for estimate, _ in self.collector.estimates]
+        seen = reduce(or_, (status for _, status in statuses), Status(0))
+        stale = sum(Status.STALE in status for _, status in statuses)
+        assert not any(Status.STALE | Status.VALID in status for _, status in statuses), fault.name
+        assert fault.flags & ~seen == 0, f"{fault.name}: flags {seen!r}, expected {Status(fault.flags)!r}"
         assert bool(stale) == fault.gaps or not self.exact, f"{fault.name}: {stale} stale estimates"
-        sequences = [e.sequence for e in estimates if not e.status & Status.STALE]
+        sequences = [sequence for sequence, status in statuses if Status.STALE not in status]
         assert all(a < b for a, b in pairwise(sequences)), fault.name
         if fault.valid_throughout and self.exact:
-            assert all(e.status & Status.VALID for e in estimates), fault.name
+            assert all(Status.VALID in status for _, status in statuses), fault.name
 
     def wrong_samples(self) -> str:
         """The first VALID sample with a value of another SYNC than its own, or nothing.

@@ -21,18 +21,13 @@ Array = np.ndarray
 Method = tuple[tuple[float, ...], list[Array], Array]
 DORMAND_PRINCE: Method = (
     (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0),
-    [
-        np.array(row)
-        for row in (
-            (1 / 5,),
-            (3 / 40, 9 / 40),
-            (44 / 45, -56 / 15, 32 / 9),
-            (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-            (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-        )
-    ],
+    [np.array(row) for row in (
+        (1 / 5,), (3 / 40, 9 / 40), (44 / 45, -56 / 15, 32 / 9),
+        (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
+        (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
+    )],
     np.array((35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)),
-)
+)  # fmt: skip
 HEUN: Method = ((0.0, 1.0), [np.array((1.0,))], np.array((0.5, 0.5)))
 
 
@@ -158,17 +153,9 @@ def simulate(
                     x[:] = before + h * (rows[i - 1] @ flat[:i]).reshape(N, width)
                 rate(start + node * h, scales[k], u, stages[i])
             x[:] = before + h * (weights @ flat).reshape(N, width)
-    phi = states[..., 2 * m, None] - states[..., :m]
-    scales = scales[:, None, None]
-    return Truth(
-        states[..., :m],
-        states[..., m : 2 * m],
-        states[..., 2 * m],
-        states[..., 2 * m + 1],
-        held,
-        scales * plants.torque(phi),
-        scales * plants.stiffness(phi),
-    )
+    q, phi, scales = states[..., 2 * m], states[..., 2 * m, None] - states[..., :m], scales[:, None, None]
+    motors, q_rate = (states[..., :m], states[..., m : 2 * m]), states[..., 2 * m + 1]
+    return Truth(*motors, q, q_rate, held, scales * plants.torque(phi), scales * plants.stiffness(phi))
 
 
 def quantise(x: Array, step: float) -> Array:

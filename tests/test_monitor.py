@@ -318,6 +318,22 @@ def web(daemon):
     close_session(session)
 
 
+@pytest.fixture
+def polling(web):
+    """The page is fed meanwhile."""
+    over = threading.Event()
+
+    def poll():
+        while not over.wait(0.02):
+            web.poll()
+
+    poller = threading.Thread(target=poll)
+    poller.start()
+    yield
+    over.set()
+    poller.join()
+
+
 def test_the_page_loads_nothing_from_elsewhere_and_answers_this_machine_only(web):
     status, page = get(web.url)
     text = page.decode()
@@ -353,46 +369,34 @@ SAVE = "HTMLAnchorElement.prototype.click = function() { saved = this.href; }; $
 
 
 @pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
-def test_the_page_draws_live_plots_in_a_browser(web, tmp_path):
-    over = threading.Event()
-
-    def poll():
-        while not over.wait(0.02):
-            web.poll()
-
-    poller = threading.Thread(target=poll)
-    poller.start()
-    try:
-        with chromium.Chromium(tmp_path / "profile") as browser:
-            browser.open(web.url)
-            browser.wait_for("document.getElementById('stiffness').textContent === '700.0'")
-            assert browser.wait_for("document.getElementById('state').textContent") == "running"
-            for width in (390, 800, 1200):  # no number reaches into the next one
-                browser.resize(width, 900)
-                assert browser.evaluate(WIDE) == 0
-            browser.wait_for(BLUE)  # the curve
-            # the residual of the status is there as a gauge, the pointer reads the curve, pause holds it
-            assert browser.wait_for("document.getElementById('gauges').textContent").startswith("residual")
-            browser.wait_for(POINT)
-            browser.wait_for("(pause(), document.getElementById('link').textContent === 'paused')")
-            browser.wait_for("(joints.elbow.moments.at(-1)[0] - frozen.elbow.moments.at(-1)[0]) > 0.2")
-            browser.screenshot(tmp_path / "page.png")
-            assert (tmp_path / "page.png").stat().st_size > 20_000
-            # the motor signals: subscribed to while they are shown, and saved with the rest
-            subscribed = lambda: [n for n, _ in web._watcher._streams if n in ("estimate", "sample")]  # noqa: E731
-            assert subscribed() == ["estimate"]
-            browser.evaluate("pause(); $('measured').click()")
-            browser.wait_for("joints.elbow.signals.length > 9 && $('motortorque').shown.series[0].length > 9")
-            assert subscribed() == ["estimate", "sample"]
-            browser.evaluate(SAVE)
-            head, *rows = browser.evaluate("decodeURIComponent(saved)").removeprefix("data:text/csv,").split()
-            columns = "time_s,flexibility_torque_nm,stiffness_nm_rad,stiffness_std_nm_rad,valid,motor1_t"
-            assert head.startswith(columns) and any(row.endswith("1.5,0.5,0,0.25") for row in rows)
-            browser.evaluate("$('measured').click()")
-            zenohkit.until(lambda: subscribed() == ["estimate"])
-    finally:
-        over.set()
-        poller.join()
+def test_the_page_draws_live_plots_in_a_browser(web, polling, tmp_path):
+    with chromium.Chromium(tmp_path / "profile") as browser:
+        browser.open(web.url)
+        browser.wait_for("document.getElementById('stiffness').textContent === '700.0'")
+        assert browser.wait_for("document.getElementById('state').textContent") == "running"
+        for width in (390, 800, 1200):  # no number reaches into the next one
+            browser.resize(width, 900)
+            assert browser.evaluate(WIDE) == 0
+        browser.wait_for(BLUE)  # the curve
+        # the residual of the status is there as a gauge, the pointer reads the curve, pause holds it
+        assert browser.wait_for("document.getElementById('gauges').textContent").startswith("residual")
+        browser.wait_for(POINT)
+        browser.wait_for("(pause(), document.getElementById('link').textContent === 'paused')")
+        browser.wait_for("(joints.elbow.moments.at(-1)[0] - frozen.elbow.moments.at(-1)[0]) > 0.2")
+        browser.screenshot(tmp_path / "page.png")
+        assert (tmp_path / "page.png").stat().st_size > 20_000
+        # the motor signals: subscribed to while they are shown, and saved with the rest
+        subscribed = lambda: [n for n, _ in web._watcher._streams if n in ("estimate", "sample")]  # noqa: E731
+        assert subscribed() == ["estimate"]
+        browser.evaluate("pause(); $('measured').click()")
+        browser.wait_for("joints.elbow.signals.length > 9 && $('motortorque').shown.series[0].length > 9")
+        assert subscribed() == ["estimate", "sample"]
+        browser.evaluate(SAVE)
+        head, *rows = browser.evaluate("decodeURIComponent(saved)").removeprefix("data:text/csv,").split()
+        columns = "time_s,flexibility_torque_nm,stiffness_nm_rad,stiffness_std_nm_rad,valid,motor1_t"
+        assert head.startswith(columns) and any(row.endswith("1.5,0.5,0,0.25") for row in rows)
+        browser.evaluate("$('measured').click()")
+        zenohkit.until(lambda: subscribed() == ["estimate"])
 
 
 def test_a_port_that_is_taken_is_one_line(web, capsys):

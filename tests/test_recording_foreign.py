@@ -23,17 +23,32 @@ CYCLES = 400
 BEGIN_S = 1_736_000_000.25
 
 
+JOINT = """\
+name = "{name}"
+[[motor]]
+inertia_kg_m2 = 0.1
+[motor.transmission]
+model = "linear"
+[motor.drive]
+node_id = {node}
+counts_per_rev = 65536
+rated_torque_nm = 2.0
+{tpdos}
+[link.encoder]
+counts_per_rev = 65536
+[bus]
+channel = "can0"
+configure = false
+sync = "follow"
+"""
+
+
 def joint_text(name, node, mapped=True):
-    tpdo = (
-        f'[[motor.drive.tpdo]]\ncob_id = {0x180 + node}\nobjects = ["0x6064:00:32", "0x60E4:01:32"]\n'
-        f'[[motor.drive.tpdo]]\ncob_id = {0x280 + node}\nobjects = ["0x6077:00:16"]\n'
+    mapping = {0x180: '"0x6064:00:32", "0x60E4:01:32"', 0x280: '"0x6077:00:16"'} if mapped else {}
+    tpdos = (
+        f"[[motor.drive.tpdo]]\ncob_id = {base + node}\nobjects = [{o}]\n" for base, o in mapping.items()
     )
-    return (
-        f'name = "{name}"\n[[motor]]\ninertia_kg_m2 = 0.1\n[motor.transmission]\nmodel = "linear"\n'
-        f"[motor.drive]\nnode_id = {node}\ncounts_per_rev = {COUNTS}\nrated_torque_nm = 2.0\n"
-        f"{tpdo if mapped else ''}[link.encoder]\ncounts_per_rev = {COUNTS}\n"
-        '[bus]\nchannel = "can0"\nconfigure = false\nsync = "follow"\n'
-    )
+    return JOINT.format(name=name, node=node, tpdos="".join(tpdos))
 
 
 class Line(NamedTuple):
@@ -47,10 +62,9 @@ class Line(NamedTuple):
 
 def truth(node):
     """(cycles,) counts of motor and link, torque in thousandths of 2 N·m."""
-    k = np.arange(CYCLES)
-    motor = np.round(9000 * np.sin(0.02 * k * node)).astype(int)
-    link = np.round(8000 * np.sin(0.02 * k * node - 0.1)).astype(int)
-    return motor, link, np.round(300 * np.cos(0.02 * k * node)).astype(int)
+    angle = 0.02 * np.arange(CYCLES) * node
+    waves = (9000 * np.sin(angle), 8000 * np.sin(angle - 0.1), 300 * np.cos(angle))
+    return tuple(np.round(wave).astype(int) for wave in waves)
 
 
 def bus():

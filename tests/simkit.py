@@ -30,8 +30,10 @@ class StubRig:
     period_s = 0.001
 
     def __init__(self) -> None:
-        self.tick = 0
-        self.commands: list[float | None] = []
+        self.tick, self.commands = 0, []
+        self.drive = lambda _motor: Readings(100 * self.tick, 3.14159265358979, 0.5, 0.05)
+        self.link_counts = lambda: 7 * self.tick
+        self.command = lambda _motor, torque_nm: self.commands.append(torque_nm)
 
     @property
     def time_s(self) -> float:
@@ -39,15 +41,6 @@ class StubRig:
 
     def advance(self, periods: int = 1) -> None:
         self.tick += periods
-
-    def drive(self, motor: int) -> Readings:
-        return Readings(100 * self.tick, 3.14159265358979, 0.5, 0.05)
-
-    def command(self, motor: int, torque_nm: float | None) -> None:
-        self.commands.append(torque_nm)
-
-    def link_counts(self) -> int:
-        return 7 * self.tick
 
 
 class Wire:

@@ -15,27 +15,29 @@ JOINT = parse('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[bus]\nchannel = "can
 FRAME = LoggedFrame(1_436_509_052_249_713_000, 0x181, bytes.fromhex("2A366C2BBA"), "can0")
 SYNC = LoggedFrame(1_436_509_052_250_713_000, 0x080, b"", "can0")
 
-# What each tool writes for FRAME and SYNC.
-VARIANTS = {
-    "candump -L": "(1436509052.249713) can0 181#2A366C2BBA\n(1436509052.250713) can0 080#\n",
-    "candump -L, newer": "(1436509052.249713) can0 181#2A366C2BBA R\n(1436509052.250713) can0 080# T\n",
-    "no brackets": "1436509052.249713 can0 181#2A366C2BBA\n1436509052.250713 can0 080#\n",
-    "lower case": "(1436509052.249713) can0 181#2a366c2bba\n(1436509052.250713) can0 080#\n",
-    "dotted bytes": "(1436509052.249713) can0 181#2A.36.6C.2B.BA\n(1436509052.250713) can0 080#\n",
-    "candump -t a": " (1436509052.249713)  can0  181   [5]  2A 36 6C 2B BA\n (1436509052.250713)  can0  080   [0]\n",
-    "candump -t a, spaced without brackets": "1436509052.249713  can0  181  [5]  2A 36 6C 2B BA\n"
-    "1436509052.250713  can0  080  [0] \n",
-    "candump -t a -a": " (1436509052.249713)  can0  181   [5]  2A 36 6C 2B BA            '*6l+.'\n"
-    " (1436509052.250713)  can0  080   [0]                            ''\n",
-    "candump -t a -x": " (1436509052.249713)  can0  RX - -  181   [5]  2A 36 6C 2B BA\n"
-    " (1436509052.250713)  can0  TX - -  080   [0] \n",
-    "candump -t A": " (2015-07-10 06:17:32.249713)  can0  181   [5]  2A 36 6C 2B BA\n"
+A, B, DATA = "(1436509052.249713)", "(1436509052.250713)", "2A 36 6C 2B BA"
+LEFT_OUT = f"""# a comment
+(1436509052.1) can0 00000181#01
+(1436509052.1) can0 181#R
+{A} can0 181#2A366C2BBA
+(1436509052.25) can0 20000080#0000000000000000
+{B} can0 080#
+"""
+VARIANTS = {  # what each tool writes for FRAME and SYNC
+    "candump -L": f"{A} can0 181#2A366C2BBA\n{B} can0 080#\n",
+    "candump -L, newer": f"{A} can0 181#2A366C2BBA R\n{B} can0 080# T\n",
+    "no brackets": f"{A[1:-1]} can0 181#2A366C2BBA\n{B[1:-1]} can0 080#\n",
+    "lower case": f"{A} can0 181#2a366c2bba\n{B} can0 080#\n",
+    "dotted bytes": f"{A} can0 181#2A.36.6C.2B.BA\n{B} can0 080#\n",
+    "candump -t a": f" {A}  can0  181   [5]  {DATA}\n {B}  can0  080   [0]\n",
+    "candump -t a, no brackets": f"{A[1:-1]}  can0  181  [5]  {DATA}\n{B[1:-1]}  can0  080  [0] \n",
+    "candump -t a -a": f" {A}  can0  181   [5]  {DATA}            '*6l+.'\n {B}  can0  080   [0]             ''\n",
+    "candump -t a -x": f" {A}  can0  RX - -  181   [5]  {DATA}\n {B}  can0  TX - -  080   [0] \n",
+    "candump -t A": f" (2015-07-10 06:17:32.249713)  can0  181   [5]  {DATA}\n"
     " (2015-07-10 06:17:32.250713)  can0  080   [0]\n",
-    "CAN FD": "(1436509052.249713) can0 181##12A366C2BBA\n(1436509052.250713) can0 080##0\n",
-    "what is not CANopen is left out": "# a comment\n(1436509052.1) can0 00000181#01\n(1436509052.1) can0 181#R\n"
-    "(1436509052.249713) can0 181#2A366C2BBA\n(1436509052.25) can0 20000080#0000000000000000\n"
-    "(1436509052.250713) can0 080#\n",
-    "CRLF": "(1436509052.249713) can0 181#2A366C2BBA\r\n(1436509052.250713) can0 080#\r\n",
+    "CAN FD": f"{A} can0 181##12A366C2BBA\n{B} can0 080##0\n",
+    "what is not CANopen is left out": LEFT_OUT,
+    "CRLF": f"{A} can0 181#2A366C2BBA\r\n{B} can0 080#\r\n",
 }
 
 
@@ -46,14 +48,10 @@ def test_each_variant_of_candump_gives_the_same_frames(name, tmp_path):
     assert list(read_frames(path)) == [FRAME, SYNC]
 
 
-def test_a_log_without_stamps_has_frames_without_stamps(tmp_path):
+def test_a_log_without_stamps_has_frames_without_them_and_differences_are_added_up(tmp_path, caplog):
     path = tmp_path / "x.log"
-    path.write_text("  can0  181   [5]  2A 36 6C 2B BA\n  can0  080   [0]\n")
+    path.write_text(f"  can0  181   [5]  {DATA}\n  can0  080   [0]\n")
     assert [f.stamp_ns for f in read_frames(path)] == [NO_STAMP, NO_STAMP]
-
-
-def test_stamps_that_are_differences_are_added_up(tmp_path, caplog):
-    path = tmp_path / "x.log"
     path.write_text("".join(f" (000.000{200 + 600 * (k % 2)})  can0  080   [0]\n" for k in range(20)))
     with caplog.at_level(logging.WARNING, "drivelink.recording"):
         stamps = [f.stamp_ns for f in read_frames(path)]
@@ -116,18 +114,19 @@ def test_of_several_channels_the_configured_one_is_taken(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "line"),
     [
-        ("x.log", b"hello\nworld\n", "expected lines as candump writes them"),
-        ("x.log", b"", "expected lines as candump writes them"),
+        *(
+            ("x.log", content, "expected lines as candump writes them")
+            for content in (b"hello\nworld\n", b"")
+        ),
         ("x.blf", b"no such thing", "cannot be read as .blf log"),
         ("x.asc", b"", "no CAN frame"),
     ],
 )
 def test_a_file_that_is_no_log_is_one_clear_line(name, content, line, tmp_path):
-    path = tmp_path / name
-    path.write_bytes(content)
-    with pytest.raises(RecordingError) as caught:
-        list(read_frames(path))
-    assert line in str(caught.value) and "\n" not in str(caught.value)
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RecordingError, match=line) as caught:
+        list(read_frames(tmp_path / name))
+    assert "\n" not in str(caught.value)
 
 
 def syncs(stamps_ms):

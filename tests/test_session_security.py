@@ -104,7 +104,7 @@ def test_nobody_else_gets_in(configure, serve, kind, changes):
 @pytest.mark.parametrize("kind", ["tls", "mtls"])
 def test_the_controllers_certificate_cannot_play_the_daemon(configure, serve, kind):
     """The authority is the right one; the certificate may not serve, and is not good for the host's name."""
-    certificate = [("daemon.pem", "controller.pem"), ("daemon.key", "controller.key")]
+    certificate = [(f"daemon.{suffix}", f"controller.{suffix}") for suffix in ("pem", "key")]
     _, publisher = serve(configure(f"daemon-{kind}.json5", *certificate))
     config = configure(f"controller-{kind}.json5", ("timeout_ms: 5000", "timeout_ms: 500"))
     with pytest.raises(ZenohError), drivelink.subscribe("elbow", config=config) as joint:

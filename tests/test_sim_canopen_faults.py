@@ -77,24 +77,18 @@ def test_a_killed_drive_is_silent_and_boots_when_its_supply_returns():
         assert wire.read(1, 0x1800, 1) == 0x40000181  # power-on mapping
 
 
-def test_a_late_tpdo_comes_after_the_next_sync_with_the_old_values():
-    with operational() as (wire, faults, first, _):
+def test_a_tpdo_that_is_late_of_wrong_length_or_comes_twice():
+    with operational() as (wire, faults, first, second):
         faults.delay(first, 2)
         assert ids(wire.say("080")) == ["282"]
         late, own, other = wire.say("080")
         assert ids([late, own, other]) == ["281", "281", "282"]
-        assert (position(late), position(own)) == (100, 200)
-
-
-def test_a_tpdo_of_wrong_length_and_one_that_comes_twice():
-    with operational() as (wire, faults, first, second):
+        assert (position(late), position(own)) == (100, 200)  # the old values, after the next SYNC
         faults.resize(first, 2, 5)
         faults.repeat(second, 2)
         frames = wire.say("080")
-        assert ids(frames) == ["281", "282", "282"]
-        assert len(frames[0].split()) == 1 + 5
-        assert frames[1] == frames[2]
-        assert len(wire.say("080")[0].split()) == 1 + 8
+        assert ids(frames) == ["281", "282", "282"] and frames[1] == frames[2]
+        assert [len(frame.split()) for frame in (frames[0], wire.say("080")[0])] == [1 + 5, 1 + 8]
 
 
 def test_an_emergency_brings_the_fault_state_until_a_rising_edge_of_bit_7():

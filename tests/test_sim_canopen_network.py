@@ -86,6 +86,7 @@ def served_ticks(stamps_s):
     network = Network(bus, [Cia402Drive(1, rig, 0)], rig)
     network.sync_filter = lambda _data: ticks.append(rig.tick) is None
     network.serve(stop)
+    bus.shutdown()
     return [*ticks[1:], rig.tick]
 
 
@@ -109,6 +110,7 @@ def test_a_bus_that_fails_is_tried_again():
     bus = ScriptedBus([can.CanOperationError("cable out"), sync(time.time())], stop)
     network = Network(bus, [Cia402Drive(1, rig, 0)], rig)
     network.serve(stop)
+    bus.shutdown()
     assert network.syncs == 1
     assert [message.arbitration_id for message in bus.sent][:1] == [0x701]
 

@@ -31,9 +31,9 @@ NOTICEABLE = {
 }  # fmt: skip
 
 
-def switched_on(name, plant=None, **further):
+def switched_on(name, plant=None, seconds=2.0, **further):
     text = ",".join([f"{name}={NOTICEABLE[name]}", *(f"{key}={value}" for key, value in further.items())])
-    return measured(plant or sea(HARDENING), parse(text), step_s=0.00025)
+    return measured(plant or sea(HARDENING), parse(text), seconds=seconds, step_s=0.00025)
 
 
 def motor_remainder(r, plant):
@@ -162,7 +162,7 @@ def test_a_lagging_torque_acts_or_is_reported_behind_a_low_pass():
     rate = np.gradient(acting, PERIOD_S)
     # Acting + lag * rate = reported; the mean of a period stands half a period after its beginning.
     assert slope(r["motor1_torque_nm"] - acting, rate) == pytest.approx(lag + 0.5 * PERIOD_S, rel=0.05)
-    late = measured(sea(HARDENING), parse(f"torque_lag={-lag}"), step_s=0.00025)
+    late = measured(sea(HARDENING), parse(f"torque_lag={-lag}"), seconds=2.0, step_s=0.00025)
     reported = late["motor1_torque_nm"]
     rate = np.gradient(reported, PERIOD_S)
     assert slope(late["truth_motor1_torque_nm"] - reported, rate) == pytest.approx(lag, abs=PERIOD_S)
@@ -216,12 +216,12 @@ READINGS = {
 
 @cache
 def healthy():
-    return measured(sea(HARDENING), step_s=0.00025)
+    return measured(sea(HARDENING), seconds=0.5, step_s=0.00025)
 
 
 @pytest.mark.parametrize("name", READINGS)
 def test_a_reading_errs_and_the_joint_does_not(name):
-    r, clean = switched_on(name), healthy()
+    r, clean = switched_on(name, seconds=0.5), healthy()
     assert r["truth_link_position_rad"] == pytest.approx(clean["truth_link_position_rad"])
     assert r["link_position_rad"] == pytest.approx(READINGS[name](r[LINK]), abs=1e-9)
 
@@ -315,7 +315,7 @@ def test_hysteresis_opens_a_loop_on_both_sides_and_creep_relaxes():
     assert on_motor == pytest.approx(on_link, abs=1e-3)
     assert 0.5 < np.max(np.abs(on_motor)) <= 1.01
     assert np.sum(on_motor * np.diff(r[PHI])[5:-5]) > 0.0  # it takes energy out
-    r = measured(sea(LINEAR), parse("creep=50,time_constant_s=0.05"), step_s=0.00025)
+    r = measured(sea(LINEAR), parse("creep=50,time_constant_s=0.05"), seconds=2.0, step_s=0.00025)
     expected, decay = [0.0], math.exp(-PERIOD_S / 0.05)
     for dphi in np.diff(r[PHI]):
         expected.append(expected[-1] * decay + 50.0 * dphi * 0.05 / PERIOD_S * (1.0 - decay))

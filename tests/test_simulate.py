@@ -81,14 +81,10 @@ def test_the_rig_moves_any_joint_enough_and_not_too_far(stiffness):
 
 
 def test_true_values_may_differ_from_the_models():
-    extra = """
-[sim]
-parameters = { motor1_inertia_kg_m2 = 0.2, motor1_coefficient2_nm_rad = 500.0, link_gravity_nm = 6.0 }
-"""
-    plant = world_from_joint(joint(extra=extra)).plant
-    assert plant.motors[0].inertia_kg_m2 == 0.2
+    values = "motor1_inertia_kg_m2 = 0.2, motor1_coefficient2_nm_rad = 500.0, link_gravity_nm = 6.0"
+    plant = world_from_joint(joint(extra=f"[sim]\nparameters = {{ {values} }}")).plant
+    assert plant.motors[0].inertia_kg_m2 == 0.2 and plant.link.gravity_nm == 6.0
     assert plant.motors[0].spring.parameters["coefficients_nm_rad"] == (150.0, 500.0)
-    assert plant.link.gravity_nm == 6.0
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,15 @@
 """What to move next: recordings that leave a question open, the motion designed for each, a random one.
 
-    python benchmarks/motion.py [--recordings 30] [--seconds 12] [--json FILE]
+    python benchmarks/motion.py [--recordings 30] [--seconds 12] [--first 0] [--last 599] [--json FILE]
 
 Joints of an independent simulator in C (`world.c`) with one effect that no file names, or none, in poor
 motions: one sine, slow sines, small moves. A recording is ambiguous if `diagnose` says that its motion is too
 poor, or gives an alternative. Its joint then plays, by a drive's position loop, the motion that
 `diagnose --motion` designs within limits, and as long a random one of the same kind, as large as the limits
 allow. Both are diagnosed. Decided: the true effect alone is named, and is likelier than all others together
-(sure: with 0.9 or more and without an alternative); of a joint with none: "sufficient". Damping of the
-transmission is left out: without [link.dynamics] no motion tells it from a late sensor.
+(sure: with 0.9 or more and without an alternative); of a joint with none: "sufficient". Rival: whether the
+truth is among those that the motion is designed for. Damping of the transmission is left out: without
+[link.dynamics] no motion tells it from a late sensor.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ def said(outcome: Diagnosis) -> str:
 def rows(args) -> Iterator[scene.Row]:
     """One row an ambiguous recording."""
     made = 0
-    for k in range(args.first, args.first + 20 * args.recordings):
+    for k in range(args.first, args.last + 1):
         (name, case), seed = list(CASES.items())[k % len(CASES)], 1 + k
         joint, motion = joint_of(case, seed), MOTIONS[(k // len(CASES)) % len(MOTIONS)]
         first = joint.moved(args.seconds, seed, **motion).record
@@ -151,6 +152,7 @@ def rows(args) -> Iterator[scene.Row]:
             "motion": motion["motion"],
             "before": said(outcome),
             "rivals": found.rivals,
+            "rival": bool(set(case.names or ("nothing",)) & set(found.rivals)),
         }
         for label, path in (("designed", best), ("random", random)):
             world, torque = joint.moved(args.seconds, seed + 1, path), np.inf
@@ -176,9 +178,11 @@ def total(made: list[scene.Row]) -> str:
     """All recordings together."""
     kinds = [f"{label}_{kind}" for label in ("designed", "random") for kind in ("decides", "sure")]
     best, surely, random, random_surely = (sum(one[kind] for one in made) for kind in kinds)
+    unlisted = [one for one in made if not one["rival"]]
     return (
         f"Of {len(made)} ambiguous recordings the designed motion decides {best} ({surely} surely), "
-        f"the random one {random} ({random_surely} surely)."
+        f"the random one {random} ({random_surely} surely). In {len(unlisted)} the truth is none of the "
+        f"rivals: of these the designed motion decides {sum(one['designed_decides'] for one in unlisted)}."
     )
 
 
@@ -186,6 +190,7 @@ COLUMNS = {
     "effect": "{effect}",
     "recorded": "{motion}",
     "said": "{before}",
+    "rival": "{rival}",
     "after the designed motion": "{designed}",
     "decided": "{designed_decides}",
     "torque / N·m": "{designed_torque_nm:.1f}",
@@ -202,6 +207,7 @@ if __name__ == "__main__":
         scene.Option("--recordings", 30),
         scene.Option("--seconds", 12.0),
         scene.Option("--first", 0, "number of the first joint"),
+        scene.Option("--last", 599, "number of the last joint"),
         scene.Option("--cases", [], "of effects"),
         after=total,
     )

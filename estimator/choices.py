@@ -110,10 +110,14 @@ CHOICES: dict[str, Choice] = {
         1.08, "spectral lines", "of a motion that separates nothing", "one, and what its window leaks"
     ),
     # The motion to record next.
-    "motion_rivals": Choice(4, "models", "told apart by a motion, at most", "pairs of them are fitted: time"),
+    "motion_rivals": Choice(6, "models", "told apart by a motion, at most", "pairs of them are fitted: time"),
     "motion_uneven": Choice(
         0.7, "", "logarithm by which a sine is faster or slower than others, at most",
         "twice or half: what nobody thought of shows too",
+    ),
+    "motion_begin": Choice(
+        0.02, "of its end", "how slowly a motion begins, at least",
+        "friction shows in slow ones, springs in fast ones",
     ),
     "motion_taper": Choice(
         0.08, "of the length", "in which a motion sets out, and in which it comes back", "a second of twelve"

@@ -22,7 +22,8 @@ from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint
 from drivelink.errors import BusError, UsageError, ZenohError
-from drivelink.jointfile import JointFile, load, parse
+from drivelink.jointfile import JointFile, load, load_text, parse
+from drivelink.loop import acceptance
 from drivelink.pubsub.client import subscribe
 from estimator.sample import Estimate, Status
 
@@ -153,7 +154,7 @@ def test_when_sync_stops_the_estimates_are_stale_and_come_back_with_it():
 @pytest.fixture
 def reloadable(tmp_path: Path) -> Iterator[DaemonRig]:
     path = tmp_path / "elbow.toml"
-    path.write_text(vsa_text(), encoding="utf-8")
+    path.write_text(f'{vsa_text()}[recording]\nfolder = "kept"\n', encoding="utf-8")
     made = DaemonRig(load(path), path)
     yield made
     made.close()
@@ -166,23 +167,34 @@ def rewrite(path: Path, old: str, new: str) -> None:
 IN_USE = "elbow.toml: the model in it is now in use"
 
 
-def test_a_rewritten_joint_file_changes_the_model_without_losing_a_cycle(reloadable, tmp_path):
-    made, estimates = reloadable, []
+def test_accepting_a_model_and_undoing_it_lose_no_cycle(reloadable, tmp_path):
+    made, path = reloadable, tmp_path / "elbow.toml"
     made.run(3000)  # until the model in use has shown itself valid
+    syncs, source, estimates = made.network.syncs, load_text(path), list[Estimate]()
     old = made.loop_joint.pipeline.estimator
-    rewrite(tmp_path / "elbow.toml", "k_nm_rad = 0.5", "k_nm_rad = wrong")
-    made.daemon.reload()
-    until(lambda: made.run(20) and any("the model stays as it is" in text for text in made.events))
-    assert made.loop_joint.pipeline.estimator is old  # a file with an error leaves the model as it is
-    rewrite(tmp_path / "elbow.toml", "k_nm_rad = wrong", "k_nm_rad = 0.51")
 
-    def changed() -> bool:
+    def exchanged() -> bool:
         estimates.extend(made.run(1))
         return made.loop_joint.pipeline.estimator is not old
 
-    until(changed)
+    rewrite(path, "k_nm_rad = 0.5", "k_nm_rad = wrong")
+    made.daemon.reload()
+    until(lambda: estimates.extend(made.run(20)) or any("the model stays as it is" in e for e in made.events))
+    assert not exchanged()  # a file with an error leaves the model as it is
+    path.write_text(source.text, encoding="utf-8")
+    better = tmp_path / "better.toml"
+    better.write_text(source.text.replace("k_nm_rad = 0.5", "k_nm_rad = 0.51"), encoding="utf-8")
+    (tmp_path / "kept").mkdir()
+    recording = tmp_path / "kept" / "elbow-20260105T081500Z-model-alarm.mcap"
+    acceptance.accept(acceptance.Proposal(source, recording, {}, load_text(better)))
+    until(exchanged)
+    assert acceptance.accepted_at(made.daemon._reloaders[0]._joint)
+    old = made.loop_joint.pipeline.estimator
+    acceptance.undo(path)
+    until(exchanged)
     estimates += made.run(50)
     sequences = [estimate.sequence for estimate in estimates]
+    assert len(sequences) == made.network.syncs - syncs
     assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
     assert not any(estimate.status & Status.STALE for estimate in estimates)
     assert all(estimate.status & Status.VALID for estimate in estimates)

@@ -238,19 +238,21 @@ def test_gaps_are_left_out(records):
 
 
 @pytest.mark.parametrize(
-    ("gain", "chosen", "probability"),
+    ("gain", "best", "chosen"),
     [
-        (0.0, "coulomb_friction", 0.9),  # a parameter more has to gain
-        (0.2, "asymmetric_friction", 0.9),
-        (np.resize([0.3, -0.2], 10), "coulomb_friction", 0.9),  # a gain within its standard error is none
+        (0.0, 0.0, "coulomb_friction"),  # a parameter more has to gain
+        (0.2, 0.0, "asymmetric_friction"),
+        (np.resize([0.3, -0.2], 10), 0.0, "coulomb_friction"),  # a gain within its standard error is none
+        (0.2, np.resize([2.3, -1.7], 10), "asymmetric_friction"),  # the best is not sure over either
     ],
 )
-def test_the_simplest_within_one_standard_error_is_chosen(gain, chosen, probability, monkeypatch):
-    simple, other = (
-        SimpleNamespace(name=name, scores=scores, log_prior=lambda *_, prior=prior: prior)
+def test_the_simplest_within_one_standard_error_is_chosen(gain, best, chosen, monkeypatch):
+    simple, other, third = (
+        SimpleNamespace(name=name, scores=scores, terms=(), log_prior=lambda *_, prior=prior: prior)
         for name, scores, prior in (
             ("coulomb_friction", np.zeros(10), -6.0),
             ("asymmetric_friction", np.zeros(10) + gain, -9.0),
+            ("presliding_friction", np.zeros(10) + best, -12.0),
         )
     )
     monkeypatch.setattr(Held, "scores", lambda _, one, among=(): one.scores)
@@ -259,11 +261,11 @@ def test_the_simplest_within_one_standard_error_is_chosen(gain, chosen, probabil
     monkeypatch.setattr(Held, "_independent", lambda *_: 300.0)
     held: Any = Held.__new__(Held)
     held.price = 3.0
-    simple.families, other.families = frozenset("a"), frozenset("ab")
-    simple.parameters, other.parameters = 2, 3
-    found = held.simplest([simple, other])
+    for one, families, parameters in zip((simple, other, third), ("a", "ab", "abc"), (2, 3, 4), strict=True):
+        one.families, one.parameters = frozenset(families), parameters
+    found = held.simplest([simple, other, third])
     assert found.name == chosen
-    assert held.weights([found, other if found is simple else simple], found)[0] > probability
+    assert held.weights([found, other if found is simple else simple], found)[0] > 0.9
 
 
 def test_friction_is_named_where_the_declared_spring_carries_nothing():

@@ -45,7 +45,11 @@ def written(folder, excitation, name="run.csv"):
 
 def test_random_motions_begin_and_end_at_rest_and_touch_a_limit():
     numbers = np.random.default_rng(1).uniform(-1.0, 1.0, (5, Shape.size(1)))
+    numbers[1:, 1:] = numbers[1, 1:]
     path = Shape(numbers, 8.0, limits()).path(1e-3)
+    early, late = (np.std(path.velocity[part], axis=(0, 2)) for part in (slice(3000), slice(-3000, None)))
+    grown = np.argsort(numbers[1:, 0])
+    assert np.all(np.diff((late / early)[1:][grown]) > 0.0)  # they grow as they are asked to
     reach = np.array([np.max(np.abs(x), axis=(0, 2)) for x in path[:3]]) / np.array([[0.6], [3.0], [30.0]])
     np.testing.assert_allclose(np.max(reach, axis=0), 1.0, rtol=1e-9)
     np.testing.assert_allclose(path.position[[0, -1]], 0.0, atol=1e-6)
@@ -60,6 +64,7 @@ def test_what_a_driven_model_reads_its_free_run_gives_back():
     model = jointfile.load(ELBOW).model()
     lossy = Effect(name="hysteresis", parameters={"torque_nm": 0.3, "displacement_rad": 0.004})
     numbers = np.random.default_rng(2).uniform(-1.0, 1.0, (2, Shape.size(1)))
+    numbers[:, :2] = -1.0, 0.0  # steady ones
     path = Shape(numbers, 8.0, limits()).path(2e-3)
     for effects in ((), (lossy,)):
         changed = replace(model, motors=(replace(model.motors[0], effects=effects),))

@@ -48,7 +48,7 @@ def as_json(motion: NextMotion) -> dict[str, Any]:
         "rivals": [
             {"effects": name, "probability": now, "told": told, "least_log_odds": least}
             for name, now, told, least in zip(
-                motion.rivals, motion.now, motion.expected, _least(motion).tolist(), strict=True
+                motion.rivals, motion.now, np.diag(motion.told).tolist(), _least(motion).tolist(), strict=True
             )
         ],
         "reaches": {name: np.max(np.abs(getattr(motion, name)), axis=0).tolist() for name in _COLUMNS},
@@ -63,7 +63,7 @@ def section(motion: NextMotion, units: Units) -> Section:
     )
     rows: list[tuple[str | Share, ...]] = []
     for name, now, told, least in zip(
-        motion.rivals, motion.now, motion.expected, _least(motion), strict=True
+        motion.rivals, motion.now, np.diag(motion.told), _least(motion), strict=True
     ):
         odds = float(np.exp(np.clip(least, 0.0, np.log(_MOST))))
         against = f"{'> ' if odds >= _MOST else ''}{odds:.3g} : 1"
@@ -93,4 +93,6 @@ def figure(motion: NextMotion, units: Units) -> Figure:
 
 def _least(motion: NextMotion) -> FloatArray:
     """Log odds of each rival over the next best, where it is the true one."""
-    return np.asarray(np.min(motion.odds, axis=1))
+    others = np.where(np.eye(len(motion.told), dtype=bool), 0.0, motion.told)
+    odds = np.diag(motion.told) / np.maximum(np.max(others, axis=1), 1.0 / _MOST)
+    return np.asarray(np.log(np.maximum(odds, 1.0 / _MOST)))

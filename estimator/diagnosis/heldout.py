@@ -136,16 +136,20 @@ class Held:
         filters and rounding leave anyway; by more than a law leaves, for a law of the same phenomenon with
         more parameters.
         """
+        return self.margin(found, rest) > 1.0
+
+    def margin(self, found: Fitted, rest: Fitted) -> float:
+        """Return how many times more than `confirms` asks for one model gains over another."""
         laws = found.families <= rest.families and found.parameters > rest.parameters
         least = float(np.mean(self._least(rest))) if laws else choice("floor") ** 2
-        if self.squared(rest) - self.squared(found) < least:
-            return False
+        fall = (self.squared(rest) - self.squared(found)) / least
         both = found, rest
         gain = self.scores(found, both) - self.scores(rest, both)
-        return bool(np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(len(gain)))
+        return min(fall, float(np.mean(gain) / max(np.std(gain, ddof=1) / np.sqrt(len(gain)), 1e-300)))
 
     def simplest(self, models: Sequence[Fitted]) -> Fitted:
-        """Return the simplest of the models that held-out data cannot tell from the best.
+        """Return the simplest of the models that held-out data cannot tell from the best, and over which no
+        other of these with as few effects is confirmed.
 
         Simple is what has the larger prior: few parameters, and declared numbers that are believed. Then, of
         laws for the same phenomena that leave no more than laws leave anyway, the simplest is chosen.
@@ -153,7 +157,8 @@ class Held:
         best = max(models, key=lambda one: float(np.mean(self.scores(one))))
         errors = self._independent(best)
         alike = [one for one in models if one is best or not self.confirms(best, one)]
-        found = max(alike, key=lambda one: one.log_prior(errors, self.price))
+        alike.sort(key=lambda one: -one.log_prior(errors, self.price))
+        found = next((one for one in alike if not self._beaten(one, alike)), best)
         most = self.squared(found)
         laws = [
             one
@@ -163,6 +168,10 @@ class Held:
             and self.squared(one) - most < float(np.mean(self._least(one)))
         ]
         return max([found, *laws], key=lambda one: one.log_prior(errors, self.price))
+
+    def _beaten(self, found: Fitted, models: Sequence[Fitted]) -> bool:
+        """Whether a model of at most as many effects is confirmed over one."""
+        return any(len(one.terms) <= len(found.terms) and self.confirms(one, found) for one in models)
 
     def weights(self, models: Sequence[Fitted], found: Fitted) -> FloatArray:
         """Return (m,) probability of each model: its prior times its stacking weight.

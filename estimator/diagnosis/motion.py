@@ -1,38 +1,39 @@
 """Designs the motion that tells rivals apart: the one to record next.
 
-Each rival is simulated along a motion. All rivals are then fitted to what each would read, with the errors of
-the recording at hand; the motion with the largest odds for the true one is searched (differential evolution).
-A motion moves about as fast at each of its frequencies: what nobody thought of shows, too.
+Each rival is simulated along a motion. All rivals are then fitted to what each would read, and judged as
+`diagnose` judges them: by blocks that are left out. The motion by which the true one gains most over each
+other is searched (differential evolution). It has many frequencies, begins slowly and reaches a limit: what
+nobody thought of shows, too.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.optimize import Bounds, differential_evolution, lsq_linear
-from scipy.special import softmax
+from scipy.stats import qmc
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.base import start
-from estimator.diagnosis.hypothesis import Fitted, Problem, count_of
+from estimator.diagnosis.candidates import Candidate, grid
+from estimator.diagnosis.heldout import Held
+from estimator.diagnosis.hypothesis import Fitted, Problem, Term, count_of
 from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.shape import Limits, Shape
-from estimator.driven import Path, driven
+from estimator.driven import driven
 from estimator.errors import EstimatorError
 from estimator.model import Effect, JointModel, LinkDynamics, Motor
 from estimator.sample import FloatArray, Record
 
 __all__ = ["NextMotion", "design"]
 
-_POPULATION, _GENERATIONS = 12, 6
+_POPULATION, _GENERATIONS = 16, 3
 _STEPS = 16.0  # of the simulation in a period of the bandwidth
-
-Name = tuple[str, int | None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,8 +46,8 @@ class NextMotion:
         torque_nm: (n, m) that the likeliest rival needs.
         rivals: in words, the likeliest first.
         now: probability of each by the recordings at hand.
-        expected: probability that each is told, where it is the true one.
-        odds: (r, r) expected log odds of the true rival (row) over each.
+        told: (r, r) probability of each (column) that a diagnosis of this motion is expected to state, where
+            one (row) is the true one.
         limits: that it keeps.
     """
 
@@ -57,14 +58,13 @@ class NextMotion:
     torque_nm: FloatArray
     rivals: tuple[str, ...]
     now: tuple[float, ...]
-    expected: tuple[float, ...]
-    odds: FloatArray
+    told: FloatArray
     limits: Limits
 
     @property
     def decides(self) -> float:
         """Probability that the true rival is told, by their present probabilities."""
-        return float(np.dot(self.now, self.expected))
+        return float(np.dot(self.now, np.diag(self.told)))
 
 
 def design(
@@ -90,15 +90,15 @@ def design(
     """
     progress("rivals")
     problem = Problem(records, model, outcome.bandwidth_hz)
-    rivals = _Rivals(problem, outcome, seconds)
     inside = limits or Limits.declared(records)
+    rivals = _Rivals(problem, outcome, seconds, inside)
     size, generation = Shape.size(len(model.motors)), iter(range(_GENERATIONS + 1))
 
     def loss(numbers: Any) -> Any:
         progress(f"motion {next(generation, _GENERATIONS)} of {_GENERATIONS}")
-        return -rivals.score(Shape(np.atleast_2d(numbers.T), seconds, inside).path(rivals.period_s), inside)
+        return -rivals.score(Shape(np.atleast_2d(numbers.T), seconds, inside))
 
-    first = np.random.default_rng(0).uniform(-1.0, 1.0, (_POPULATION, size))
+    first = 2.0 * qmc.LatinHypercube(size, rng=0).random(_POPULATION) - 1.0
     best = differential_evolution(
         loss, Bounds(-np.ones(size), np.ones(size)), popsize=1, maxiter=_GENERATIONS, polish=False,
         vectorized=True, updating="deferred", rng=0, init=first,
@@ -109,106 +109,105 @@ def design(
 class _Rivals:
     """What may be missing: each fitted to the recordings, and as a model to simulate."""
 
-    def __init__(self, problem: Problem, outcome: Diagnosis, seconds: float) -> None:
+    def __init__(self, problem: Problem, outcome: Diagnosis, seconds: float, limits: Limits) -> None:
         search = Search(problem)
-        self.problem, self.fitted = problem, _fitted(search, outcome)
-        if len(self.fitted) < 2:
-            raise EstimatorError("the diagnosis leaves no rivals that a motion could tell apart")
-        best = min(self.fitted, key=lambda one: float(np.sum(np.log(one.posterior.sigma))))
-        scores = np.array([one.evidence(best) - search.held.price * len(one.terms) for one in self.fitted])
-        order = np.argsort(-scores)
-        self.fitted = [self.fitted[k] for k in order]
-        self.now, self.price = softmax(scores[order]), search.held.price
-        link = problem.model.link or _link(problem, best)
-        self.models = [_model(problem, one, link) for one in self.fitted]
+        found, fitted = _fitted(search, outcome)
+        now = search.held.weights(fitted, found)
+        order = np.argsort(-now, kind="stable")[: whole("motion_rivals")]
+        self.problem, self.limits = problem, limits
+        link = problem.model.link or _link(problem, found)
         step = 1.0 / (_STEPS * problem.bandwidth_hz * problem.period_s)
         self.period_s = problem.period_s * max(1, math.floor(step))
-        each = (best.posterior.sigma, best.times * problem.signals[0].narrow.period_s)
-        self.sigma, self.times_s = (x[: problem.equations] for x in each)
-        self.noise = _noise(problem, round(self.period_s / problem.period_s), seconds)
+        models = [_model(problem, fitted[k], link) for k in order]
+        plain = Shape(np.zeros((1, Shape.size(len(problem.model.motors)))), seconds, limits)
+        path = self.within(plain, models[:1], whole("newton_steps")).path(self.period_s)
+        steady = [math.isfinite(_over(driven(path, model)[0], limits)) for model in models]
+        self.models = [model for model, holds in zip(models, steady, strict=True) if holds]
+        order = order[steady]  # the law of another one does not hold as far as the joint is to move
+        if len(order) < 2:
+            raise EstimatorError("the diagnosis leaves no rivals that a motion could tell apart")
+        self.fitted = [fitted[k] for k in order]
+        self.now = now[order] / np.sum(now[order])
+        self.noise = _noise(problem, found, self.period_s, seconds)
 
-    def score(self, path: Path, limits: Limits) -> FloatArray:
-        """Return (w,) how far each motion tells the rivals apart: mean log of the least odds of each."""
+    def score(self, shape: Shape) -> FloatArray:
+        """Return (w,) how far each motion tells the rivals apart: mean of how surely each is told."""
+        path = self.within(shape, self.models[:1], 1).path(self.period_s)
         runs = [[self.read(run) for run in driven(path, model)] for model in self.models]
         made = []
-        for k in range(path.position.shape[1]):
-            if not all(np.all(np.isfinite(run[k].motor_torque_nm)) for run in runs):
+        for k in range(len(shape.numbers)):
+            each = [run[k] for run in runs]
+            over = max(_over(run, self.limits) for run in each)
+            if not math.isfinite(over):
                 made.append(0.0)  # a rival that leaves the world
                 continue
-            least = np.min(self.odds([run[k] for run in runs], 0), axis=1)
-            over = max(_over(run[k], limits) for run in runs)
-            made.append(np.mean(np.log1p(np.maximum(least, 0.0))) / max(over, 1.0) ** 2)
+            least = np.array([self.least(i, run) for i, run in enumerate(each)])
+            made.append(float(np.mean(least / (1.0 + least))) / max(over, 1.0) ** 2)
         return np.array(made)
 
+    def within(self, shape: Shape, models: Sequence[JointModel], passes: int) -> Shape:
+        """Return the motions, smaller where one of the models needs more torque than the limits have."""
+        for _ in range(passes):
+            path = shape.path(self.period_s)
+            over = np.max([[_over(run, self.limits) for run in driven(path, one)] for one in models], axis=0)
+            if np.all(over <= 1.0):
+                break
+            less = np.where(over > 1.0, choice("motion_margin") / over, 1.0)
+            shape = shape._replace(share=shape.share * less)
+        return shape
+
     def read(self, run: Record) -> Record:
-        """Return a recording as the encoders read it."""
-        theta, q = (noise[: len(run)] for noise in self.noise)
+        """Return a recording as it is read: rounded, and with what the fit leaves of the one at hand."""
+        theta, q, torque = self.noise
         link = None if run.link_position_rad is None else run.link_position_rad + q[:, 0]
-        return replace(run, motor_position_rad=run.motor_position_rad + theta, link_position_rad=link)
+        return replace(
+            run, motor_position_rad=run.motor_position_rad + theta, link_position_rad=link,
+            motor_torque_nm=run.motor_torque_nm + torque,
+        )  # fmt: skip
 
-    def odds(self, runs: Sequence[Record], steps: int | None = None) -> FloatArray:
-        """Return (r, r) the log odds of the rival that made each recording over each; inf over itself."""
-        made = np.full((len(runs),) * 2, np.inf)
-        for i, run in enumerate(runs):
-            problem = self.problem.alike([run])
-            own = self._refitted(problem, i, steps)
-            floor = np.maximum(own.regression.floor, self.sigma)
-            times = np.maximum(self.times_s / problem.signals[0].narrow.period_s, 1.0)
-            for j in range(len(runs)):
-                if j != i:
-                    other = self._refitted(problem, j, steps)
-                    mine, theirs = (
-                        replace(one.regression, floor=floor).solve(times, one.posterior).evidence
-                        for one in (own, other)
-                    )
-                    price = self.price * (len(other.terms) - len(own.terms))
-                    made[i, j] = mine - theirs + price
-        return made
+    def least(self, i: int, run: Record) -> float:
+        """Return how many times more than `diagnose` asks for the i-th rival, which made a recording, gains
+        over the best of the others.
+        """
+        held, fitted = self._judged(run, 0)
+        return max(min(held.margin(fitted[i], one) for j, one in enumerate(fitted) if j != i), 0.0)
 
-    def _refitted(self, problem: Problem, j: int, steps: int | None) -> Fitted:
-        one = self.fitted[j]
-        return problem.fit(one.terms, start(problem.frames[0]), one.corrections[:1], steps)
+    def _judged(self, run: Record, steps: int | None) -> tuple[Held, list[Fitted]]:
+        """What decides about a recording, and all rivals fitted to it."""
+        problem = self.problem.alike([run])
+        base = start(problem.frames[0])
+        fitted = [problem.fit(one.terms, base, one.corrections[:1], steps) for one in self.fitted]
+        return Held(problem), fitted
 
     def motion(self, shape: Shape) -> NextMotion:
-        """Return one motion, small enough for the limits of torque."""
-        limits, factor = shape.limits, 1.0
-        for _ in range(whole("newton_steps")):
-            path = shape.path(self.period_s).moved(-limits.centre_rad).scaled(factor).moved(limits.centre_rad)
-            runs = [driven(path, model)[0] for model in self.models]
-            over = max(_over(run, limits) for run in runs)
-            if over <= 1.0:
-                break
-            factor *= choice("motion_margin") / over
-        else:
+        """Return one motion, small enough for the limits of torque whatever is the true rival."""
+        shape = self.within(shape, self.models, whole("newton_steps"))
+        runs = [driven(shape.path(self.period_s), model)[0] for model in self.models]
+        if not all(_over(run, self.limits) <= 1.0 for run in runs):
             raise EstimatorError(
                 "limits: expected a torque that holds the joint and moves it, it is too small"
             )
-        odds = self.odds([self.read(run) for run in runs])
-        fine = (
-            shape.path(self.problem.period_s)
-            .moved(-limits.centre_rad)
-            .scaled(factor)
-            .moved(limits.centre_rad)
-        )
-        time = np.asarray(np.arange(len(fine.position)) * fine.period_s, dtype=np.float64)
+        judged = [self._judged(self.read(run), None) for run in runs]
+        path = shape.path(self.problem.period_s)
+        time = np.asarray(np.arange(len(path.position)) * path.period_s, dtype=np.float64)
         torque = [np.interp(time, runs[0].time_s, x) for x in runs[0].motor_torque_nm.T]
         return NextMotion(
-            time_s=time, position_rad=fine.position[:, 0], velocity_rad_s=fine.velocity[:, 0],
-            acceleration_rad_s2=fine.acceleration[:, 0], torque_nm=np.column_stack(torque),
+            time_s=time, position_rad=path.position[:, 0], velocity_rad_s=path.velocity[:, 0],
+            acceleration_rad_s2=path.acceleration[:, 0], torque_nm=np.column_stack(torque),
             rivals=tuple(map(_words, self.fitted)), now=tuple(self.now.tolist()),
-            expected=tuple((1.0 / (1.0 + np.sum(np.exp(-np.clip(odds, -_most(), np.inf)), axis=1))).tolist()),
-            odds=odds, limits=limits,
+            told=np.array([held.weights(fitted, fitted[i]) for i, (held, fitted) in enumerate(judged)]),
+            limits=self.limits,
         )  # fmt: skip
 
 
-def _most() -> float:
-    return math.log(np.finfo(np.float64).max) / 2.0
-
-
-def _noise(problem: Problem, every: int, seconds: float) -> tuple[FloatArray, FloatArray]:
-    """Rounding of the motors' readings (n, m) and the link's (n, 1), as of so many samples' mean."""
-    record, rows = problem.records[0], round(seconds / problem.period_s)
-    draw = np.random.default_rng(0)
+def _noise(
+    problem: Problem, found: Fitted, period_s: float, seconds: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rounding of the motors' readings (n, m) and the link's (n, 1), as of so many samples' mean; and (n, m)
+    of torque, what a fit leaves of the first recording, repeated.
+    """
+    record, rows = problem.records[0], round(seconds / period_s)
+    draw, every = np.random.default_rng(0), round(period_s / problem.period_s)
     link = record.link_position_rad
     read = (record.motor_position_rad, record.motor_position_rad if link is None else link[:, None])
     theta, q = (
@@ -217,7 +216,13 @@ def _noise(problem: Problem, every: int, seconds: float) -> tuple[FloatArray, Fl
         / math.sqrt(12.0 * every)
         for each in read
     )
-    return theta, q
+    left, step_s = found.regression.residual(found.posterior.x), problem.signals[0].narrow.period_s
+    at = np.arange(rows) * period_s / step_s
+    torque = [
+        np.interp(at % (len(mine) - 1), np.arange(len(mine)), mine)
+        for mine in (left[problem.group == i] for i in range(record.motor_position_rad.shape[1]))
+    ]
+    return theta, q, np.column_stack(torque)
 
 
 def _over(run: Record, limits: Limits) -> float:
@@ -230,42 +235,42 @@ def _words(fitted: Fitted) -> str:
     return " and ".join(names) or "nothing"
 
 
-def _fitted(search: Search, outcome: Diagnosis) -> list[Fitted]:
-    """What was found, its alternatives, then single effects and nothing, fitted."""
-    made: dict[frozenset[Name], Fitted] = {}
-    for names in _sets(outcome):
-        one = _with(search, names)
-        if one is not None and len(made) < whole("motion_rivals"):
-            made.setdefault(one.keys, one)
-    return list(made.values())
+def _fitted(search: Search, outcome: Diagnosis) -> tuple[Fitted, list[Fitted]]:
+    """What was found, and with it what a diagnosis holds against it: the declared model, and for each effect
+    nothing or another one, also of a law that the motion hides.
+    """
+    found = search.null
+    for effect in outcome.effects:
+        found = search.with_effect(found, effect.name, effect.motor) or found
+    made = {search.null.keys: search.null, found.keys: found}
+    near: list[tuple[Fitted, Candidate | None]] = [
+        (search.problem.without(found, k), term.candidate) for k, term in enumerate(found.terms)
+    ]
+    for rest, like in near or [(search.null, None)]:
+        for one in [rest, *search.grown(rest, like)]:
+            seen = one is rest or one.is_real_beside(rest)
+            made.setdefault(one.keys, one if seen else _hidden(search.problem, rest, one.terms[-1].candidate))
+    return found, list(made.values())
 
 
-def _sets(outcome: Diagnosis) -> Iterable[list[Name]]:
-    """Sets of effects, the likeliest first."""
-    found = [(f.name, f.motor) for f in outcome.effects if f.name != "unlisted"]
-    yield found
-    for k, finding in enumerate(outcome.effects):
-        for name in finding.alternatives:
-            yield [(name, finding.motor) if j == k else one for j, one in enumerate(found)]
-    for rival in outcome.rivals[: whole("motion_rivals") - 1]:
-        yield [(rival.name, rival.motor)]
-    yield []
+def _hidden(problem: Problem, rest: Fitted, candidate: Candidate) -> Fitted:
+    """An effect that the motion holds at zero, with the shape that it hides best."""
+    each = [
+        problem.added(rest, Term(candidate, values), 0)
+        for values in grid(problem.frames[0], candidate, problem.smoothing_rad_s)
+    ]
+    return max(each, key=lambda one: float(np.sum(_std(one)[[s.kind == "term" for s in one.slots]])))
 
 
-def _with(search: Search, names: Sequence[Name]) -> Fitted | None:
-    """The declared model with these effects; None: the recording does not have one of them."""
-    fitted = search.null
-    for name, motor in names:
-        grown = search.with_effect(fitted, name, motor)
-        if grown is None:
-            return None
-        fitted = grown
-    return search.problem.fit(fitted.terms, fitted.base, fitted.corrections)
+def _std(fitted: Fitted) -> FloatArray:
+    """(k,) standard deviations, free of bounds."""
+    free = replace(fitted.regression, low=np.full_like(fitted.regression.low, -np.inf))
+    return np.sqrt(np.maximum(np.diag(free.solve(fitted.times, fitted.posterior).covariance), 0.0))
 
 
 def _model(problem: Problem, fitted: Fitted, link: LinkDynamics) -> JointModel:
     """A fitted hypothesis as a model; an effect is as large as its standard deviation at least."""
-    std = np.sqrt(np.maximum(np.diag(fitted.posterior.covariance), 0.0))
+    std = _std(fitted)
     motors, at_link = [[*m.effects] for m in problem.model.motors], [*problem.model.link_effects]
     for k, term in enumerate(fitted.terms):
         kind = term.candidate.kind

@@ -198,8 +198,11 @@ class Search:
         self, parent: Fitted, like: Candidate | None = None, most: int | None = None
     ) -> list[Fitted]:
         """Return the most promising extensions by one effect; `like`, `most`: see `screen`."""
-        grown = (self._grown(parent, term) for term in self.screen(parent, like, most))
-        return [child for child in grown if child.is_real_beside(parent)]
+        return [child for child in self.grown(parent, like, most) if child.is_real_beside(parent)]
+
+    def grown(self, parent: Fitted, like: Candidate | None = None, most: int | None = None) -> list[Fitted]:
+        """Return the same with those that the data hold at zero."""
+        return [self._grown(parent, term) for term in self.screen(parent, like, most)]
 
     def with_effect(self, parent: Fitted, name: str, motor: int | None) -> Fitted | None:
         """Return the extension by a named effect; None: the data cannot reveal it."""

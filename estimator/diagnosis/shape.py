@@ -68,16 +68,26 @@ class Limits:
 
 
 class Shape(NamedTuple):
-    """Motions by their numbers (w, 16 m): logarithms of amplitudes, and phases, of each motor's sines."""
+    """Motions that reach a limit.
+
+    Attributes:
+        numbers: (w, 2 + 16 m), each from -1 to 1: how much slower the motion begins than it ends; whether its
+            sines are alike in acceleration (-1), velocity (0) or position (1); then logarithms of amplitudes,
+            and phases, of each motor's sines.
+        seconds: of the motion.
+        limits: of the motors.
+        share: (w,) of what the limits allow.
+    """
 
     numbers: FloatArray
     seconds: float
     limits: Limits
+    share: FloatArray | float = 1.0
 
     @staticmethod
     def size(motors: int) -> int:
-        """Return how many numbers a motion has, each from -1 to 1."""
-        return 2 * len(_HARMONICS) * motors
+        """Return how many numbers a motion has."""
+        return 2 + 2 * len(_HARMONICS) * motors
 
     def path(self, period_s: float) -> Path:
         """Return the motions within the limits of position, velocity and acceleration."""
@@ -85,33 +95,47 @@ class Shape(NamedTuple):
         omega = 2.0 * np.pi * _HARMONICS / self.seconds
         s, c = (f(np.outer(time, omega)) for f in (np.sin, np.cos))
         count, motors = len(self.numbers), len(self.limits.low_rad)
-        size, turn = np.moveaxis(self.numbers.reshape(count, motors, 2, -1), 2, 0)
-        amplitude, phase = np.exp(choice("motion_uneven") * size) / _HARMONICS, np.pi * turn
+        (growth, tilt), numbers = self.numbers.T[:2], self.numbers[:, 2:]
+        size, turn = np.moveaxis(numbers.reshape(count, motors, 2, -1), 2, 0)
+        even = np.power.outer(_HARMONICS.astype(float), tilt - 1.0).T[:, None]
+        amplitude, phase = even * np.exp(choice("motion_uneven") * size), np.pi * turn
         a, b = amplitude * np.cos(phase), amplitude * np.sin(phase)
         series = [
             np.einsum("tk,wmk->twm", left * rate, a) + np.einsum("tk,wmk->twm", right * rate, b)
             for left, right, rate in ((s, c, omega**0), (c, -s, omega), (-s, -c, omega**2))
         ]
-        position, velocity, acceleration = _tapered(series, time, self.seconds)
+        growth = -0.5 * np.log(choice("motion_begin")) * (1.0 + growth)
+        position, velocity, acceleration = _shaped(series, time, self.seconds, growth)
         path = Path(position, velocity, acceleration, period_s)
         limits, half = self.limits, 0.5 * (self.limits.high_rad - self.limits.low_rad)
-        most = (half, limits.velocity_rad_s, limits.acceleration_rad_s2)
-        reach = [np.max(np.abs(x), axis=0) / limit for x, limit in zip(path[:3], most, strict=True)]
-        return path.scaled(1.0 / np.max(reach, axis=(0, 2))).moved(limits.centre_rad)
+        each = zip(path[:3], (half, limits.velocity_rad_s, limits.acceleration_rad_s2), strict=True)
+        reach = [np.max(np.abs(x), axis=0) / limit for x, limit in each]
+        return path.scaled(self.share / np.max(reach, axis=(0, 2))).moved(limits.centre_rad)
 
 
-def _tapered(series: Sequence[FloatArray], time: Any, seconds: float) -> Iterator[FloatArray]:
-    """Value, rate and second derivative of a series times a smooth step at both ends."""
-    span = choice("motion_taper") * seconds
+def _shaped(
+    series: Sequence[FloatArray], time: Any, seconds: float, growth: FloatArray
+) -> Iterator[FloatArray]:
+    """Value, rate and second derivative of a series that grows (w,), times a smooth step at both ends."""
+    span, rate = choice("motion_taper") * seconds, growth / seconds
     ends = [(np.clip(time / span, 0.0, 1.0), 1.0), (np.clip((seconds - time) / span, 0.0, 1.0), -1.0)]
-    (a, da, dda), (b, db, ddb) = (
-        (x**3 * (10 - 15 * x + 6 * x**2), way * 30 * (x * (1 - x)) ** 2 / span,
-         60 * x * (1 - x) * (1 - 2 * x) / span**2)
+    grown = np.exp(np.outer(time - seconds, rate))
+    factors = [(grown, rate * grown, rate**2 * grown)] + [
+        tuple(
+            x[:, None]
+            for x in (
+                x**3 * (10 - 15 * x + 6 * x**2),
+                way * 30 * (x * (1 - x)) ** 2 / span,
+                60 * x * (1 - x) * (1 - 2 * x) / span**2,
+            )
+        )
         for x, way in ends
-    )  # fmt: skip
-    w, dw, ddw = ((x[:, None, None]) for x in (a * b, da * b + a * db, dda * b + 2 * da * db + a * ddb))
-    y, dy, ddy = series
-    return iter((w * y, dw * y + w * dy, ddw * y + 2 * dw * dy + w * ddy))
+    ]
+    for w, dw, ddw in factors:
+        y, dy, ddy = series
+        w, dw, ddw = w[..., None], dw[..., None], ddw[..., None]
+        series = w * y, dw * y + w * dy, ddw * y + 2 * dw * dy + w * ddy
+    return iter(series)
 
 
 def _rates(record: Record) -> list[FloatArray]:

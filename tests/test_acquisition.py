@@ -106,6 +106,9 @@ def test_a_node_that_was_configured_again_owes_nothing():
     given = [run(assembler, [(SYNC, b""), *vsa_cycle(k), (0x183, link(70_000))]) for k in range(6, 20)]
     assert assembler.counters[3].late == 1  # the sample of that cycle is flagged, and the last one
     assert not any(given[2:])
+    told = [assembler.flags for k in range(20, 50) if run(assembler, [(SYNC, b""), *vsa_cycle(k)])]
+    # Two answered: the one that is left may count from elsewhere.
+    assert [bool(flags & Status.NODE_RESTARTED) for flags in told[:3]] == [True, False, False]
 
 
 def test_samples_after_a_lost_frame_stay_flagged_until_it_cannot_be_a_late_one():

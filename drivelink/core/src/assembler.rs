@@ -388,6 +388,7 @@ impl Assembler {
         if !same && !self.spoiled {
             decoder.conflict = CONFLICT_CYCLES; // two nodes answer, or somebody babbles: believe neither
             self.spoiled = true;
+            self.restart = true; // the one that is left may count from elsewhere
             counters.conflicting += 1;
         }
         false

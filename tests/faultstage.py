@@ -20,6 +20,7 @@ import can
 from daemonkit import Collector
 from faultscript import Fault
 
+from drivelink._core import Tick
 from drivelink.canopen.layout import MappedObject, Signal
 from drivelink.daemon.service import Daemon
 from drivelink.demo.simulate import network_from_joint, nodes_from_joint, world_from_joint
@@ -114,9 +115,11 @@ class Sink(Collector):
         """Start anew."""
         self.estimates, self.samples, self.payloads, self.due = [], [], [], []
 
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        super().put_sample(sample, stamp_ns)
-        current = sample.sequence == self._stage.loop_joint.pipeline.assembler.sequence
+    def put(self, tick: Tick) -> None:
+        super().put(tick)
+        if tick.sample is None:
+            return
+        current = tick.sample.sequence == self._stage.loop_joint.pipeline.assembler.sequence
         truth = self._stage.truth
         self.due.append(truth.syncs - (1 if current or truth.unseen else 2))
 

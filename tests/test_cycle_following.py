@@ -25,11 +25,12 @@ class Master:
         self.log: list[tuple[int, int, bytes]] = []
         self.stamp_ns = 1_800_000_000 * 1_000_000_000
         self.valid: list[tuple[int, dict[str, float]]] = []  # SYNC of the nodes, and that of each value
-        self.run.judge.put_sample = self._keep  # type: ignore[method-assign]
+        self.run.judge.put = self._keep  # type: ignore[method-assign]
 
-    def _keep(self, sample, _stamp_ns: int) -> None:
-        estimate = self.run.pipeline.estimate
-        assert estimate is not None and estimate.status & Status.VALID
+    def _keep(self, tick) -> None:
+        sample = tick.sample
+        if sample is None or not tick.estimate.status & Status.VALID:
+            return
         later = self.run.pipeline.assembler.sequence - sample.sequence  # given at the end of its cycle
         self.valid.append((self.run.bus.tick - later, self.run.ticks_of(sample)))
 

@@ -22,13 +22,14 @@ class Follower:
         self.stamp_ns = START_NS
         self.counter = 0
         self.found: list[tuple[int, int, set[float]]] = []
-        self.run.judge.put_sample = self._keep  # type: ignore[method-assign]
+        self.run.judge.put = self._keep  # type: ignore[method-assign]
         self.periods: list[float] = []  # that the daemon is to begin anew with
         self.run.supervisor.bus.on_period = self.periods.append
 
-    def _keep(self, sample, _stamp_ns: int) -> None:
-        status = self.run.pipeline.estimate.status
-        self.found.append((sample.sequence, status, set(self.run.ticks_of(sample).values())))
+    def _keep(self, tick) -> None:
+        if tick.sample is not None and tick.estimate.status & Status.VALID:
+            values = set(self.run.ticks_of(tick.sample).values())
+            self.found.append((tick.sample.sequence, tick.estimate.status, values))
 
     def syncs(self, count: int) -> None:
         for _ in range(count):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 from pathlib import Path
@@ -80,26 +79,6 @@ def test_columns_of_others_are_read_in_our_names_and_units_also_in_place_of_ours
     assert parse_column_map(["a=b=time_s:us"])["time_s"] == ("a=b", 1e-6, True)
 
 
-def test_channels_of_an_mf4_file_are_read_and_mapped_where_asammdf_is_installed(tmp_path):
-    record, path = read(ours(tmp_path / "r.csv"), JOINT), tmp_path / "r.mf4"
-    if importlib.util.find_spec("asammdf") is None:
-        path.touch()
-        with pytest.raises(RecordingError, match=r'MF4 needs asammdf: pip install "drivelink-vsa\[mf4\]"'):
-            read(path, JOINT)
-        return
-    from asammdf import MDF, Signal
-
-    link, motor, torque = record.link_position_rad, record.motor_position_rad, record.motor_torque_nm
-    values = {"motor1_position_rad": motor[:, 0], "motor1_torque_nm": torque[:, 0], "link_position_rad": link}
-    with MDF(version="4.10") as mdf:
-        mdf.append([Signal(v, record.time_s, name=name) for name, v in values.items()])
-        mdf.save(path)
-    back = read(path, JOINT)
-    assert np.array_equal(back.sequence, record.sequence) and np.array_equal(back.motor_torque_nm, torque)
-    turned = read(path, None, names=parse_column_map(["link_position_rad=motor1_position_rad:deg"]))
-    assert np.allclose(turned.motor_position_rad[:, 0], np.radians(link), rtol=1e-14)
-
-
 def test_a_format_with_columns_is_one_entry(tmp_path, monkeypatch):
     entry = Format(columns=lambda path, _: (dict(np.load(path)), ()))
     monkeypatch.setitem(FORMATS, ".npz", entry)
@@ -136,7 +115,7 @@ def test_what_a_mapping_asks_for_in_vain_is_one_line(tmp_path):
     with pytest.raises(UsageError, match="given twice"):
         parse_column_map(["a=time_s", "b=time_s"])
     open_sink(tmp_path / "r.mcap", JOINT).close()
-    with pytest.raises(UsageError, match="only CSV and MF4 files have columns to be named"):
+    with pytest.raises(UsageError, match="only CSV files have columns to be named"):
         read(tmp_path / "r.mcap", JOINT, names=names)
 
 

@@ -78,7 +78,7 @@ def recorded(path, frames, every, ended=True):
 
 
 @pytest.mark.parametrize(
-    ("suffix", "ended"), [(s, e) for s in (".log", ".blf", ".asc", ".trc") for e in (True, False)]
+    ("suffix", "ended"), [(s, e) for s in (".log", ".blf", ".asc") for e in (True, False)]
 )
 def test_what_is_recorded_is_read_back_also_without_its_end(suffix, ended, tmp_path):
     frames = many_frames()

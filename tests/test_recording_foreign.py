@@ -8,6 +8,7 @@ import logging
 import math
 import struct
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -133,41 +134,6 @@ def vector_asc(lines, *, base="hex", stamps="absolute", fd=False):
     return "".join([*out, "End TriggerBlock\r\n"]).encode("cp1252")
 
 
-PEAK_ROWS = {
-    "1.0": "{n:6})  {t:10.3f}  {i}  {l}  {b}",
-    "1.1": "{n:6})  {t:12.3f}  Rx     {i}  {l}  {b}",
-    "1.2": "{n:6})  {t:12.3f} 1  Rx     {i}  {l}  {b}",
-    "1.3": "{n:6})  {t:12.3f} 1  Rx     {i} -  {l}    {b}",
-    "2.0": "{n:7}  {t:12.3f} {d}     {i} Rx {l}  {b}",
-    "2.1": "{n:7}  {t:12.3f} {d} 1      {i} Rx -  {l}    {b}",
-}
-PEAK_ERRORS = {
-    "1.0": "{n:6})  {t:10.1f}  FFFFFFFF  4  00 00 00 08  BUSHEAVY",
-    "1.1": "{n:6})  {t:12.3f} Error 0008 4 00 19 08 08",
-    "1.2": "{n:6})  {t:12.3f} 1  Error 0008 4 00 19 08 08",
-    "1.3": "{n:6})  {t:12.3f} 1  Error 0008 - 4 00 19 08 08",
-    "2.0": "{n:7}  {t:12.3f} ER     -    Rx  5    04 02 00 00 00",
-    "2.1": "{n:7}  {t:12.3f} ER 1     -    Rx -  5    04 02 00 00 00",
-}
-
-
-def peak_trc(lines, version):
-    out = [";##########################################################################\r\n"]
-    if version != "1.0":
-        out = [f";$FILEVERSION={version}\r\n", ";$STARTTIME=45661.5928269676\r\n"]
-    if version[0] == "2":
-        out.append(f";$COLUMNS={'N,O,T,B,I,d,R,L,D' if version == '2.1' else 'N,O,T,I,d,L,D'}\r\n")
-    out.append(";   PCAN-View, the file is as it is\r\n;\r\n")
-    for number, (t, can_id, data, kind) in enumerate(lines, 1):
-        ms = (t - lines[0].time_s) * 1e3
-        name = f"{can_id:08X}" if kind == "extended" else f"{can_id:04X}"
-        bytes_ = "RTR" if kind == "remote" else spaced(data)
-        rr = "RR" if kind == "remote" else "DT"
-        row = PEAK_ERRORS[version] if kind == "error" else PEAK_ROWS[version]
-        out.append(row.format(n=number, t=ms, i=name, d=rr, l=len(data), b=bytes_) + "\r\n")
-    return "".join(out).encode("cp1252")
-
-
 def vector_blf(lines):
     """Objects of the header's version 1 in containers that are not packed; one object reaches into the next."""
     objects = b""
@@ -198,7 +164,6 @@ TOOLS: dict[str, tuple[str, Callable[[list[Line]], bytes]]] = {
     "ASC, relative stamps": (".asc", lambda lines: vector_asc(lines, stamps="relative")),
     "ASC, decimal": (".asc", lambda lines: vector_asc(lines, base="dec")),
     "ASC, CAN FD": (".asc", lambda lines: vector_asc(lines, fd=True)),
-    **{f"TRC {v}": (".trc", lambda lines, v=v: peak_trc(lines, v)) for v in ("1.0", "1.1", "1.2", "1.3", "2.0", "2.1")},
     "BLF": (".blf", vector_blf),
 }  # fmt: skip
 
@@ -257,8 +222,16 @@ def test_what_is_missing_is_one_line_that_says_how_to_give_it(without, mapped, s
     assert "\n" not in text and all(word in text for word in said), text
 
 
-def test_a_trace_of_an_unknown_version_is_not_guessed_at(tmp_path):
-    path = tmp_path / "r.trc"
-    path.write_bytes(peak_trc(bus(), "2.1").replace(b"=2.1", b"=3.0"))
-    with pytest.raises(DrivelinkError, match=r"expected a PCAN trace of version 1\.0, .*, got '3\.0'"):
-        read(path, parse(joint_text("a", 1)))
+@pytest.mark.parametrize(
+    ("name", "command"), [("r.mf4", "asammdf"), ("r.trc", "can_logconvert r.trc r.trc.log")]
+)
+def test_a_file_in_another_format_is_one_line_with_the_command_that_converts_it(
+    name, command, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).touch()
+    for work in (read, lambda path, joint: open_playback(path, joint, tmp_path)):
+        with pytest.raises(
+            DrivelinkError, match=f"{name}: not a format of recordings; to convert it: .*{command}"
+        ):
+            work(Path(name), parse(joint_text("a", 1)))

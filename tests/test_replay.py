@@ -33,7 +33,7 @@ from drivelink.recording.sinks import Sink
 from estimator.sample import Estimate, Status
 
 BEGIN_NS = 1_700_000_000_000_000_000
-FORMATS = (".log", ".blf", ".asc", ".trc", ".mcap", ".csv")
+FORMATS = (".log", ".blf", ".asc", ".mcap", ".csv")
 CYCLES = 400
 
 

@@ -164,7 +164,7 @@ def add_map(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="SOURCE=COLUMN[:UNIT]",
-        help="use a column of a CSV or MF4 file as one of drivelink's, e.g. q_link=link_position_rad:deg; "
+        help="use a column of a CSV file as one of drivelink's, e.g. q_link=link_position_rad:deg; "
         "a factor may stand for UNIT, e.g. tau=motor1_torque_nm:-0.05; may be repeated",
     )
 

@@ -44,7 +44,7 @@ The ending of FILE selects the format:
   .mcap                     samples, estimates, status, model, joint file and raw CAN: replays everything,
                             opens in Foxglove and PlotJuggler
   .csv                      samples
-  .log .blf .asc .trc       raw CAN, as candump, Vector's and PEAK's tools write it
+  .log .blf .asc            raw CAN, as candump and Vector's tools write it
 
 A raw CAN log gets FILE.mapping.json beside it: how the daemon has the frames mapped, and the joint file.
 

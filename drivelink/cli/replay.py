@@ -31,7 +31,7 @@ _METER_EVERY = 512
 _SUBSCRIBER_S = 1.5
 
 EPILOG = """\
-formats: .csv, .mcap, .mf4 (with asammdf), and raw CAN: candump .log in its variants, .blf, .asc, .trc
+formats: .csv, .mcap, and raw CAN: candump .log in its variants, .blf, .asc
 
 examples:
   drivelink replay run.csv --joint elbow.toml --out estimates.csv --plots plots/

@@ -230,7 +230,7 @@ class BusSection(_Section):
 
 
 class ColumnSection(_Section):
-    """Where one of our columns comes from in a plant's own CSV or MF4 files."""
+    """Where one of our columns comes from in a plant's own CSV files."""
 
     name: str = Field(min_length=1, description="of the column in the file")
     unit: str | float = Field("", description="of its numbers, or a factor; left out: that of our name")

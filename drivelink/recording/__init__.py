@@ -11,7 +11,7 @@ from drivelink.errors import RecordingError, UsageError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canframes import is_frame_log, read_frame_record
 from drivelink.recording.columns import ColumnMap, column_map, record_from_columns, renamed
-from drivelink.recording.formats import FORMATS
+from drivelink.recording.formats import CONVERTERS, FORMATS
 from drivelink.recording.mcapfile import read_mcap
 from estimator.sample import Record
 
@@ -35,7 +35,7 @@ def read(
         base_dir: folder of the joint file, base of its EDS files.
         channel: of a raw CAN log with several.
         keep_nan: keep rows with NaN, for use tick by tick; else they become gaps.
-        names: columns of a CSV or MF4 file with other names or units, beside those of the joint file.
+        names: columns of a CSV file with other names or units, beside those of the joint file.
 
     Raises:
         RecordingError: it cannot be read, or is incomplete.
@@ -46,6 +46,8 @@ def read(
         raise RecordingError(f"{path}: no such file")
     if path.is_dir():
         raise RecordingError(f"{path}: expected a file, got a folder")
+    if command := CONVERTERS.get(path.suffix.lower()):
+        raise RecordingError(f"{path}: not a format of recordings; to convert it: {command.format(path)}")
     read_columns = FORMATS.get(path.suffix.lower(), FORMATS[".csv"]).columns
     if read_columns is not None:
         names = column_map(joint, names)
@@ -54,7 +56,7 @@ def read(
         left = tuple(name for name in ignored if name not in ours)
         return record_from_columns(ours, str(path), joint, keep_nan, left)
     if names:
-        raise UsageError(f"--map: {path}: only CSV and MF4 files have columns to be named")
+        raise UsageError(f"--map: {path}: only CSV files have columns to be named")
     if is_frame_log(path):
         return read_frame_record(path, joint, Path(base_dir), channel)
     return read_mcap(path, joint, keep_nan)

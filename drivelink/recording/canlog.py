@@ -1,4 +1,4 @@
-"""Reads raw CAN logs of other tools: variants of candump; BLF, ASC, PCAN .trc by python-can's readers.
+"""Reads raw CAN logs of other tools: variants of candump; BLF, ASC by python-can's readers.
 
 Yields data frames with 11-bit identifiers as tuples, in file order.
 """
@@ -23,7 +23,6 @@ from drivelink.recording.limits import (
     MAX_LINE_BYTES,
     AscText,
     BlfBytes,
-    TrcText,
     most_records,
     require_stamp,
     too_many_records,
@@ -54,7 +53,6 @@ CAN_FORMATS = {
     ".candump": CanFormat(None),
     ".blf": CanFormat(_BlfWriter, can.BLFReader, BlfBytes, text=False),
     ".asc": CanFormat(can.ASCWriter, can.ASCReader, AscText),
-    ".trc": CanFormat(can.TRCWriter, can.TRCReader, TrcText),
 }
 """Formats of raw frames, by the ending of the file's name."""
 

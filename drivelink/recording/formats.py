@@ -1,4 +1,4 @@
-"""The formats of recordings, by the ending of the file's name: reader of columns (CSV, MF4), writer.
+"""The formats of recordings, by the ending of the file's name: reader of columns (CSV), writer.
 
 A file is read in blocks of lines; only the numbers of known columns are kept in memory.
 """
@@ -202,40 +202,6 @@ def _wrong_line(block: bytes, layout: _Layout, path: Path, first_line: int) -> s
     return f"{path}: cannot be read as CSV"
 
 
-def read_mf4_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
-    """Read the channels named like the CSV columns, at the times of the first one, held in between.
-
-    Args:
-        names: columns with other names in the file.
-
-    Returns:
-        (rows,) values of each by its name in the file; no names of others.
-
-    Raises:
-        RecordingError: asammdf is not installed, or the file cannot be read.
-    """
-    try:
-        from asammdf import MDF
-    except ImportError as error:
-        raise RecordingError(f'{path}: MF4 needs asammdf: pip install "drivelink-vsa[mf4]"') from error
-    wanted = {source.column for source in names.values()} | COLUMNS - {"time_s"}
-    try:
-        open_regular(path).close()
-        with MDF(path) as mdf:
-            for group in mdf.groups:
-                require_samples(group.channel_group.cycles_nr, str(path))
-            signals = mdf.select([name for name in mdf.channels_db if name in wanted])
-        if not signals:
-            raise RecordingError(f"{path}: expected channels named motor1_position_rad, …, found none")
-        times = signals[0].timestamps
-        columns = {one.name: one.interp(times, 0, 0).samples for one in signals}
-    except RecordingError:
-        raise
-    except Exception as error:  # asammdf raises whatever a broken byte leads it to
-        raise RecordingError(f"{path}: cannot be read as MF4: {error}") from error
-    return {k: np.asarray(v, dtype=np.float64) for k, v in {"time_s": times, **columns}.items()}, ()
-
-
 Columns = tuple[dict[str, FloatArray], tuple[str, ...]]
 
 
@@ -252,8 +218,15 @@ class Format(NamedTuple):
 FORMATS = {
     ".mcap": Format(McapSink),
     ".csv": Format(CsvSink, read_csv_columns, text=True),
-    ".mf4": Format(columns=read_mf4_columns),
 } | {suffix: Format(CanSink if kind.writer else None, text=kind.text) for suffix, kind in CAN_FORMATS.items()}
+
+
+CONVERTERS = {
+    ".mf4": 'python -c "from asammdf import MDF; '
+    "MDF('{0}').to_dataframe().to_csv('{0}.csv', index_label='time_s')\"",
+    ".trc": "can_logconvert {0} {0}.log",
+}
+"""Command lines that make a recording of a file in another format, by its ending."""
 
 
 def open_sink(path: Path, joint: JointFile, joint_text: str = "", *, force: bool = False) -> Sink:

@@ -1,8 +1,8 @@
 """Memory limits of recordings, checked before allocation, and bounded input of python-can's readers.
 
 A file declares the lengths of its parts and may declare anything. Real recordings are far below these limits
-(docs/reference/recordings.md). python-can's readers accept lines and containers of any length, read a PCAN
-trace of an unknown version as version 1.0, and ignore relative stamps of an ASC file.
+(docs/reference/recordings.md). python-can's readers accept lines and containers of any length, and ignore
+relative stamps of an ASC file.
 """
 
 from __future__ import annotations
@@ -74,7 +74,6 @@ _EMPTY_FD = re.compile(
     r"\s+\d+\s+\d+\s+([0-9A-Fa-f]+)(?:\s|$)"
 )
 _REMOTE = 0x10  # among these flags
-_TRC_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "2.0", "2.1")
 
 
 class BlfBytes(io.BufferedIOBase):
@@ -112,19 +111,21 @@ class BlfBytes(io.BufferedIOBase):
         )
 
 
-class _Text(io.TextIOBase):
-    """The lines of a log; an incomplete last line is omitted."""
+class AscText(io.TextIOBase):
+    """An ASC file with relative stamps converted to absolute ones; an incomplete last line is omitted."""
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         super().__init__()
         self._file, self._path = file, path
         self._number = 0
+        self._relative = False
+        self._total = 0.0
 
     def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
         """Return the next line in the reader's form; "" at the end.
 
         Raises:
-            RecordingError: it is too long, or of an unknown version.
+            RecordingError: it is too long.
         """
         line = self._file.readline(MAX_LINE_BYTES + 1)
         self._number += 1
@@ -139,19 +140,6 @@ class _Text(io.TextIOBase):
         return self._known(line.decode(errors="replace"))
 
     def _known(self, line: str) -> str:
-        """The line in the reader's form."""
-        raise NotImplementedError
-
-
-class AscText(_Text):
-    """An ASC file with relative stamps converted to absolute ones."""
-
-    def __init__(self, file: IO[bytes], path: Path) -> None:
-        super().__init__(file, path)
-        self._relative = False
-        self._total = 0.0
-
-    def _known(self, line: str) -> str:
         if _RELATIVE.match(line):
             self._relative = True
         elif self._relative and (stamp := _STAMP.match(line)):
@@ -159,29 +147,4 @@ class AscText(_Text):
             line = f"{self._total:.9f}{line[stamp.end() :]}"
         if (empty := _EMPTY_FD.match(line)) and not int(empty[5], 16) & _REMOTE:
             return f"{empty[1]} {empty[2]} {empty[4]} {empty[3]} d 0\n"  # else it is read as a remote frame
-        return line
-
-
-class TrcText(_Text):
-    """A PCAN trace; version 1.2 lacks the empty column before the length of version 1.3."""
-
-    def __init__(self, file: IO[bytes], path: Path) -> None:
-        super().__init__(file, path)
-        self._without_column = False
-
-    def _known(self, line: str) -> str:
-        line = line.lstrip("\ufeff")
-        if line.startswith(";$FILEVERSION"):
-            version = line.partition("=")[2].strip()
-            if version not in _TRC_VERSIONS:
-                raise RecordingError(
-                    f"{self._path}: expected a PCAN trace of version {', '.join(_TRC_VERSIONS)}, "
-                    f"got {version[:20]!r}"
-                )
-            if version == "1.2":
-                self._without_column = True
-                return ";$FILEVERSION=1.3\n"
-        elif self._without_column and not line.startswith(";"):
-            cells = line.split(maxsplit=5)
-            return " ".join([*cells[:5], "-", *cells[5:]]).rstrip() + "\n" if len(cells) > 5 else line
         return line

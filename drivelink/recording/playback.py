@@ -83,7 +83,7 @@ def open_playback(
         frames: of an MCAP file, play the raw frames (True) or the samples (False); None: the samples, and
             the frames where there are none.
         channel: of a raw CAN log with several.
-        names: columns of a CSV or MF4 file with other names or units.
+        names: columns of a CSV file with other names or units.
 
     Raises:
         RecordingError: it cannot be read, or is incomplete.

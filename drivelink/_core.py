@@ -2,6 +2,7 @@
 
 from estimator._core import (
     LATE,
+    LATEST,
     MESSAGES,
     STATUS_BITS,
     SYNC_COB_ID,
@@ -19,6 +20,7 @@ from estimator._core import (
 
 __all__ = [
     "LATE",
+    "LATEST",
     "MESSAGES",
     "STATUS_BITS",
     "SYNC_COB_ID",

@@ -7,6 +7,7 @@ from estimator.online import Estimator
 from estimator.sample import Estimate, External, Sample
 
 LATE: int
+LATEST: float
 MESSAGES: dict[str, list[tuple[str, str, str]]]
 STATUS_BITS: dict[str, int]
 SYNC_COB_ID: int
@@ -288,7 +289,9 @@ class JointPipeline:
     def missed(self) -> int: ...
     @property
     def complete(self) -> bool: ...
-    def feed(self, cob_id: int, data: bytes, jump: int = 1, stamp_ns: int = 0) -> Tick | None:
+    def feed(
+        self, cob_id: int, data: bytes, jump: int = 1, stamp_ns: int = 0, late_ns: int = 0
+    ) -> Tick | None:
         """Take one frame (see `Assembler.feed`); what is published of the cycle that it ends, if it does.
 
         A cycle that is closed without a sample gives the last estimate again, under its own sequence
@@ -300,6 +303,7 @@ class JointPipeline:
             jump: for a SYNC, whole periods since the one before; 0: one that was not due; `LATE`: one whose
                 period is over.
             stamp_ns: for a SYNC that was due, its UNIX time.
+            late_ns: by how much it was sent later than that; widens the interval of the external torque.
 
         Raises:
             Exception: whatever an estimator in Python raises.
@@ -323,13 +327,14 @@ class JointPipeline:
             ValueError: the bytes are of another version or kind of joint, or no snapshot.
         """
 
-    def take(self, sample: Sample, flags: int = 0, stamp_ns: int = 0) -> Tick:
+    def take(self, sample: Sample, flags: int = 0, stamp_ns: int = 0, late_ns: int = 0) -> Tick:
         """Take one sample as it was recorded.
 
         Args:
             sample: of the cycle.
             flags: service bits of `Status` that hold for it.
             stamp_ns: UNIX time of its SYNC.
+            late_ns: as in `feed`.
         """
 
     def carry_on(self, sequence: int, flags: int = 0, stamp_ns: int | None = None) -> Tick | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import onlinekit
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from drivelink import jointfile
@@ -147,6 +148,29 @@ def test_it_is_valid_where_the_estimate_is_and_its_standard_deviation_is_that_of
     assert np.mean(np.abs(off) < 1.96) > 0.90
     # The motor's dry friction is undeclared: what the balance leaves of it widens the interval.
     assert np.sqrt(np.mean(off**2)) > 0.1
+
+
+def test_what_a_late_sync_does_to_the_positions_is_no_contact_and_pushes_are_found_beside_it(pushed):
+    """Every 200th SYNC is late by up to a period: true motion, read later."""
+    rng = np.random.default_rng(1)
+    t = T * np.arange(len(pushed["time_s"]))
+    late = np.where(rng.random(t.size) < 0.005, rng.uniform(0.0, T, t.size), 0.0)
+    read = {
+        name: CubicSpline(t, pushed[name])(t + late) for name in ("motor1_position_rad", "link_position_rad")
+    }
+    contact = {}
+    for told in (False, True):
+        estimator = make_estimator(model(), EstimatorSettings(contact_torque_nm=0.2), T)
+        pipeline = JointPipeline(Assembler((), 0), estimator)
+        late_ns = (told * late * 1e9).astype(int).tolist()
+        external = [
+            pipeline.take(sample, late_ns=ns).external
+            for sample, ns in zip(samples(pushed | read), late_ns, strict=True)
+        ]
+        contact[told] = np.array([one.status & CONTACT > 0 for one in external])
+    free, after = slice(0, round(PUSHES[0][0] / T)), [round((begin + PUSH_S) / T) for begin, _ in PUSHES]
+    assert contact[False][free].any() and not contact[True][free].any()
+    assert all(contact[True][end - round(PUSH_S / T) : end].any() for end in after)
 
 
 @pytest.mark.parametrize("error", [0.02, -0.05, 0.10])

@@ -168,11 +168,12 @@ class CycleLoop:
         """Return the stamps of so many SYNCs on time."""
         return range(start_ns, start_ns + cycles * self.period_ns, self.period_ns)
 
-    def tick(self, stamp_ns: int, jump: int = 1) -> None:
+    def tick(self, stamp_ns: int, jump: int = 1, deadline_ns: int | None = None) -> None:
         """Produce SYNC. Frames received before it belong to the previous cycle.
 
         Args:
             jump: periods since the one before.
+            deadline_ns: monotonic time at which it was due; None: it is on time.
         """
         self.syncs += 1
         try:
@@ -184,7 +185,7 @@ class CycleLoop:
         now = self.sync_ns = time.monotonic_ns()
         if frames:
             self._dispatch(frames, now)
-        self._sync(b"", stamp_ns, jump, now)
+        self._sync(b"", stamp_ns, jump, now, 0 if deadline_ns is None else now - deadline_ns)
 
     def receive(self) -> None:
         """Take and process the received frames."""
@@ -250,7 +251,7 @@ class CycleLoop:
             self._counter = data[0]
         self._sync(data, stamp_ns, jump, now_ns)
 
-    def _sync(self, data: bytes, stamp_ns: int, jump: int, now_ns: int) -> None:
+    def _sync(self, data: bytes, stamp_ns: int, jump: int, now_ns: int, late_ns: int = 0) -> None:
         if jump > 0:
             self.cycles += 1
             self.syncs = self.cycles
@@ -259,18 +260,24 @@ class CycleLoop:
             if loop_joint.fault:
                 tick = self._carry_on_faulted(loop_joint, jump, stamp_ns)
             else:
-                tick = self._feed(loop_joint, SYNC_COB_ID, data, jump, stamp_ns)
+                tick = self._feed(loop_joint, SYNC_COB_ID, data, jump, stamp_ns, late_ns)
             if tick is not None:
                 self._publish(loop_joint, tick, now_ns)
         for follow in self.after_sync:
             follow()
 
     def _feed(
-        self, loop_joint: LoopJoint, cob_id: int, data: bytes, jump: int = 1, stamp_ns: int = 0
+        self,
+        loop_joint: LoopJoint,
+        cob_id: int,
+        data: bytes,
+        jump: int = 1,
+        stamp_ns: int = 0,
+        late_ns: int = 0,
     ) -> Tick | None:
         """Pass a frame to one joint; an exception ends only its estimates."""
         try:
-            return loop_joint.pipeline.feed(cob_id, data, jump, stamp_ns)
+            return loop_joint.pipeline.feed(cob_id, data, jump, stamp_ns, late_ns)
         except Exception as error:  # noqa: BLE001 - see above
             loop_joint.fault = f"{type(error).__name__}: {error}"
             loop_joint.broken = loop_joint.pipeline.estimator

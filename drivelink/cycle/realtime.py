@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from drivelink._core import LATEST
 from drivelink.cycle.loop import CycleLoop
 
 PRIORITY = 80  # of 1 to 99: above the network's interrupt threads (50), below the kernel's watchdogs (99)
@@ -118,7 +119,6 @@ class Alarm:
             pass
 
 
-_LATEST = 0.4  # of a period: a later SYNC is skipped, being nearer to the next one
 _MARGIN_NS = 120_000  # before the deadline, when waiting for frames ends
 _SILENCE_PERIODS = 5  # when following: time without SYNC until the estimates are stale
 _SILENCE_NS = 20_000_000  # and at least
@@ -159,7 +159,7 @@ class _Expectation:
 
 def _produce(loop: CycleLoop) -> None:
     clock, period = time.monotonic_ns, loop.period_ns
-    latest = int(_LATEST * period)
+    latest = int(LATEST * period)
     alarm = Alarm()
     expectation = _Expectation(period)
     deadline = clock() + period
@@ -174,7 +174,7 @@ def _produce(loop: CycleLoop) -> None:
             jump += 0 if loop.world_steps else left_out
             deadline += left_out * period
             continue
-        loop.tick(deadline + loop.unix_ns, jump)
+        loop.tick(deadline + loop.unix_ns, jump, None if loop.world_steps else deadline)
         loop.lateness.add(late)
         jump = 1
         deadline += period

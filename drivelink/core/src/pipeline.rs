@@ -34,6 +34,9 @@ pub trait Step: Send {
     /// As for `step`.
     fn distrust(&mut self) -> Result<(), Failure>;
 
+    /// The next sample is later than its period by so many seconds.
+    fn delay_next(&mut self, _late_s: f64) {}
+
     /// Whether the monitor of the model raises the alarm, after this step.
     ///
     /// # Errors
@@ -66,6 +69,10 @@ impl Step for Estimator {
         Ok(())
     }
 
+    fn delay_next(&mut self, late_s: f64) {
+        Estimator::delay_next(self, late_s);
+    }
+
     fn external(&mut self) -> Result<Option<External>, Failure> {
         Ok(Estimator::external(self))
     }
@@ -74,8 +81,8 @@ impl Step for Estimator {
 /// What a frame leads to.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Due {
-    /// A sample to be estimated, with the service bits that hold for it.
-    Sample(Sample, u32),
+    /// A sample to be estimated, with the service bits that hold for it, and how late its SYNC was, s.
+    Sample(Sample, u32, f64),
     /// A cycle of this number that gave no sample, with its service bits.
     Missed(i64, u32),
 }
@@ -124,6 +131,7 @@ impl Tick {
 pub struct Pipeline {
     sync_ns: i64,
     sync_before_ns: i64,
+    late_s: [f64; 2], // the last SYNC, and the one before
     sequence: i64,
     last: Option<Tick>,
     /// Cycles that gave no sample.
@@ -131,22 +139,24 @@ pub struct Pipeline {
 }
 
 impl Pipeline {
-    /// Take one frame, see [`Assembler::feed`]; `stamp_ns`: for a SYNC, its UNIX time.
+    /// Take one frame, see [`Assembler::feed`]; of a SYNC its UNIX time, and by how much it was later than that.
     pub fn feed(
         &mut self,
         assembler: &mut Assembler,
         cob_id: u32,
         data: &[u8],
         jump: i64,
-        stamp_ns: i64,
+        (stamp_ns, late_ns): (i64, i64),
     ) -> Option<Due> {
         if cob_id == SYNC_COB_ID && jump > 0 {
             self.sync_before_ns = std::mem::replace(&mut self.sync_ns, stamp_ns);
+            self.late_s = [late_ns as f64 * 1e-9, self.late_s[0]];
         }
         let sample = assembler.feed(cob_id, data, jump);
         self.sequence = assembler.sequence;
         if let Some(sample) = sample {
-            return Some(Due::Sample(sample, assembler.flags));
+            let before = usize::from(sample.sequence as i64 != self.sequence);
+            return Some(Due::Sample(sample, assembler.flags, self.late_s[before]));
         }
         let missed = assembler.missed.take()?;
         self.missed += 1;
@@ -225,6 +235,7 @@ pub fn estimate(
     estimator: &mut dyn Step,
     sample: &Sample,
     mut flags: u32,
+    late_s: f64,
 ) -> Result<(Estimate, Option<External>), Failure> {
     if flags & NODE_RESTARTED != 0 {
         estimator.lose_zeros()?;
@@ -233,6 +244,7 @@ pub fn estimate(
     if flags & (UNTIMED | CONTRADICTED) != 0 {
         estimator.distrust()?;
     }
+    estimator.delay_next(late_s);
     let mut estimate = estimator.step(sample)?;
     if estimator.alarm(sample, &estimate)? {
         flags |= MODEL_ALARM;
@@ -305,7 +317,7 @@ mod tests {
 
     fn run(stiffness: f64, alarm: bool, flags: u32) -> (u32, Vec<&'static str>) {
         let mut fixed = Fixed { stiffness, alarm, told: Vec::new() };
-        let results = estimate(&mut fixed, &SAMPLE, flags).unwrap();
+        let results = estimate(&mut fixed, &SAMPLE, flags, 0.0).unwrap();
         (Pipeline::default().take(&SAMPLE, 1, results, Some(9)).estimate.status, fixed.told)
     }
 
@@ -332,7 +344,7 @@ mod tests {
         let mut pipeline = Pipeline::default();
         assert!(pipeline.carry_on(1, 0, None).is_none());
         let mut fixed = Fixed { stiffness: 150.0, alarm: false, told: Vec::new() };
-        let results = estimate(&mut fixed, &SAMPLE, 0).unwrap();
+        let results = estimate(&mut fixed, &SAMPLE, 0, 0.0).unwrap();
         pipeline.take(&SAMPLE, 1, results, Some(9));
         let tick = pipeline.carry_on(6, 0, Some(10)).unwrap();
         assert_eq!((tick.estimate.sequence, tick.estimate.status, tick.stamp_ns), (6, STALE, 10));

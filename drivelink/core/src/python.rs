@@ -52,6 +52,7 @@ mod extension {
         let messages = crate::wire::MESSAGES.map(|(name, fields)| (name, fields.to_vec()));
         module.add("MESSAGES", HashMap::from(messages))?;
         module.add("LATE", crate::assembler::LATE)?;
+        module.add("LATEST", estimator_core::external::LATEST)?;
         module.add("STOP_EXPONENT", estimator_core::memory::STOP_EXPONENT)?;
         module.add("SYNC_COB_ID", crate::assembler::SYNC_COB_ID)?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))

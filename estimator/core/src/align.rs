@@ -48,6 +48,8 @@ pub struct Inputs {
     pub torque: [f64; MOTORS],
     /// q and θ as of now, where the torques are later.
     pub present: Positions,
+    /// By how much the sample is later than its period, s.
+    pub late: f64,
 }
 
 impl Inputs {
@@ -58,6 +60,7 @@ impl Inputs {
             at: self.at.towards(&to.at, share),
             torque: std::array::from_fn(|i| self.torque[i] + share * (to.torque[i] - self.torque[i])),
             present: self.present.towards(&to.present, share),
+            late: self.late + share * (to.late - self.late),
         }
     }
 }
@@ -104,6 +107,7 @@ impl Alignment {
             at: Positions { link: link.at.link, motor: motor.at.motor },
             torque: motor.torque,
             present: Positions { link: link.present.link, motor: motor.present.motor },
+            late: inputs.late,
         }
     }
 }
@@ -120,7 +124,7 @@ mod tests {
         for k in 0..20 {
             let k = f64::from(k);
             let at = Positions { link: k, motor: [k; 2] };
-            out = alignment.align(&Inputs { at, torque: [k; 2], present: at }, k == 0.0);
+            out = alignment.align(&Inputs { at, torque: [k; 2], present: at, late: 0.0 }, k == 0.0);
         }
         assert!((out.at.motor[0] - 16.75).abs() < 1e-12 && (out.at.link - 19.0).abs() < 1e-12);
     }

@@ -79,6 +79,14 @@ impl Estimator {
         }
     }
 
+    /// The next sample is later than its period by so many seconds; no further one is.
+    pub fn delay_next(&mut self, late_s: f64) {
+        match self {
+            Estimator::Paper(_) => {}
+            Estimator::Robust(robust) => robust.delay_next(late_s),
+        }
+    }
+
     /// Standard deviation of the joint's flexibility torque at the last sample, N·m; NaN: unknown.
     #[must_use]
     pub fn flexibility_torque_std(&self) -> f64 {

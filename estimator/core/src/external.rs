@@ -35,6 +35,8 @@ const MEMORY_S: f64 = 20.0; // of how far the declared link is off, as that of t
 const FLOOR: f64 = 1e-3; // of the torque carried: no curve is known better
 const CONSISTENCY_S: f64 = 10.0; // over which the two flexibility torques are compared
 const TINY: f64 = 1e-12; // keeps a division finite
+/// Of a period: a later sample is nearer to the next one.
+pub const LATEST: f64 = 0.4;
 
 /// Bits of [`External::status`].
 pub mod status {
@@ -165,9 +167,11 @@ pub struct LinkMomentum {
     gravity: [f64; 3],
     carried: [f64; 3],
     measured: [f64; 3],
-    last: [f64; 4], // q, g, τ_e, τ_k
-    skew: f64,      // between the encoders, before any data, s
-    dry: f64,       // undeclared dry friction, as a share of the torque carried
+    shifted: [f64; 3], // what a late sample is off by in q …
+    pulled: [f64; 3],  // … and in g + τ_e
+    last: [f64; 6],    // of these channels, in this order
+    skew: f64,         // between the encoders, before any data, s
+    dry: f64,          // undeclared dry friction, as a share of the torque carried
     errors: LinkErrors,
     judge: Judge,
     /// See [`Said`].
@@ -202,7 +206,9 @@ impl LinkMomentum {
             gravity: [0.0; 3],
             carried: [0.0; 3],
             measured: [0.0; 3],
-            last: [0.0; 4],
+            shifted: [0.0; 3],
+            pulled: [0.0; 3],
+            last: [0.0; 6],
             judge: Judge::new(settings, filter.bandwidth, period_s),
             filter,
             skew: priors.encoder_delay * period_s,
@@ -229,9 +235,9 @@ impl LinkMomentum {
     /// At rest here.
     pub fn restart(&mut self, q: f64, carried: f64) {
         let rest = StateVariableFilter::<3>::rest;
-        self.last = [q, gravity(&self.link, q), carried, 0.0];
+        self.last = [q, gravity(&self.link, q), carried, 0.0, 0.0, 0.0];
         (self.position, self.gravity, self.carried) = (rest(q), rest(self.last[1]), rest(carried));
-        self.measured = rest(0.0);
+        (self.measured, self.shifted, self.pulled) = (rest(0.0), rest(0.0), rest(0.0));
         self.distrust();
     }
 
@@ -244,18 +250,31 @@ impl LinkMomentum {
     }
 
     /// One period: q, what the transmissions do to the link where that is known, and τ_k where it is measured.
-    pub fn feed(&mut self, q: f64, carried: Option<f64>, measured: f64) {
+    ///
+    /// `late`: by how much they are later than their period, s. Each is then off by its rate times that.
+    pub fn feed(&mut self, q: f64, carried: Option<f64>, measured: f64, late: f64) {
         let before = self.last;
         let known = carried.filter(|torque| torque.is_finite());
         let external = if measured.is_finite() { measured } else { 0.0 };
-        self.last = [q, gravity(&self.link, q), known.unwrap_or(before[2]), external];
-        let channels = [&mut self.position, &mut self.gravity, &mut self.carried, &mut self.measured];
+        let ahead = 3.0 / self.filter.bandwidth; // the filtered rates are as old as that
+        let off = |channel: &[f64; 3]| late * (channel[1] + ahead * channel[2]);
+        let (shifted, pulled) = (off(&self.position), off(&self.gravity) + off(&self.carried));
+        let carried = known.unwrap_or(before[2]);
+        self.last = [q, gravity(&self.link, q), carried, external, shifted, pulled];
+        let channels = [
+            &mut self.position,
+            &mut self.gravity,
+            &mut self.carried,
+            &mut self.measured,
+            &mut self.shifted,
+            &mut self.pulled,
+        ];
         for (i, channel) in channels.into_iter().enumerate() {
             self.filter.smooth.apply(channel, before[i], self.last[i]);
         }
         self.unsettled -= 1;
         self.known = known.is_some();
-        if !self.known {
+        if !self.known || late > LATEST * self.period {
             self.distrust();
         }
     }
@@ -290,14 +309,16 @@ impl LinkMomentum {
         // A reading that is rounded errs alike for as long as it stands: what the spring makes of it is no noise.
         let read = carried.reading + carried.stiffness.powi(2) * noise;
         let white = noise * (link.inertia.powi(2) * self.gains[2] + link.damping.powi(2) * self.gains[1]);
-        let around = carried.variance + read + unknown;
+        let late = link.inertia * self.shifted[2] + link.damping * self.shifted[1] + self.pulled[0];
+        let late = late * late;
+        let around = carried.variance + read + unknown + late;
         let valid = valid && self.unsettled <= 0 && (sum + around + white).is_finite();
         let (torque, contact) = self.judge.see(sum - off, self.carried[0], around, white, valid);
         let usual = torque.abs() <= BAND_SIGMA * (around + white).sqrt();
         if valid && usual && !contact {
             // Errors of readings last as long as the filter does; that of the curve does not average out at all.
             let curve = carried.variance + (FLOOR * self.judge.largest).powi(2);
-            let lasting = (read + white) / self.filter.bandwidth + curve * MEMORY_S;
+            let lasting = (read + white + late) / self.filter.bandwidth + curve * MEMORY_S;
             self.errors.identify(&row, sum - self.measured[0], lasting / self.period);
         }
         let external = External {

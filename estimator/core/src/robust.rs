@@ -48,6 +48,7 @@ pub struct Robust {
     momentum: Option<LinkMomentum>,
     external: Option<External>,
     measured: f64, // τ_k
+    late: f64,     // the sample at hand, s
     noise: [NoiseMeter; MOTORS + 1],
     torque_noise: [NoiseMeter; MOTORS],
     noise_gains: [f64; 3],
@@ -109,6 +110,7 @@ impl Robust {
             momentum: LinkMomentum::new(model, settings, priors, period_s),
             external: None,
             measured: f64::NAN,
+            late: 0.0,
             noise: [NoiseMeter::default(); MOTORS + 1],
             torque_noise: [NoiseMeter::default(); MOTORS],
             noise_gains: filters.noise_gains(period_s),
@@ -163,6 +165,11 @@ impl Robust {
         self.unsettled = self.settle;
         self.momentum.iter_mut().for_each(LinkMomentum::distrust);
         self.sides.iter_mut().for_each(Side::cut);
+    }
+
+    /// The next sample is later than its period by so many seconds; no further one is.
+    pub fn delay_next(&mut self, late_s: f64) {
+        self.late = late_s;
     }
 
     /// What the world does to the link, by the last sample; `None` where no link dynamics are declared.
@@ -222,6 +229,7 @@ impl Robust {
     pub fn step(&mut self, sample: &Sample) -> Estimate {
         // Can it be used, and how far is it from the last one that was?
         let accepted = self.validator.check(sample);
+        let late = std::mem::take(&mut self.late);
         self.refused = match (accepted.suspicion, self.refused) {
             (Some(now), _) => Some((now, self.said_periods)),
             (None, before) => before.map(|(was, left)| (was, left - 1)).filter(|(_, left)| *left > 0),
@@ -249,8 +257,8 @@ impl Robust {
         self.sequence = sample.sequence;
         let mut torque = corrected.aligned.motor_torque;
         torque[self.motors..].fill(0.0);
-        let inputs =
-            Inputs { at: at.from_zeros(&self.zeros), torque, present: present.from_zeros(&self.zeros) };
+        let (at, present) = (at.from_zeros(&self.zeros), present.from_zeros(&self.zeros));
+        let inputs = Inputs { at, torque, present, late };
         if accepted.frozen {
             self.distrust();
         }
@@ -326,12 +334,13 @@ impl Robust {
             }
         }
         if self.momentum.is_some() {
-            let (now, measured) = (&now.present, self.measured);
+            let (measured, late) = (self.measured, now.late);
+            let now = &now.present;
             let carried = self.carried(now).map(|carried| carried.torque);
             let lost = self.sides.iter().any(|side| side.blocks.is_lost());
             if let Some(momentum) = &mut self.momentum {
                 momentum.note_zero(lost);
-                momentum.feed(now.link, carried, measured);
+                momentum.feed(now.link, carried, measured, late);
             }
         }
         self.last = *now;

@@ -184,6 +184,15 @@ impl Step for Driver {
         Python::attach(|py| self.estimator.call_method0(py, "distrust").map(drop)).map_err(Failure::from)
     }
 
+    fn delay_next(&mut self, late_s: f64) {
+        let Some(compiled) = &self.compiled else { return };
+        Python::attach(|py| {
+            if let Ok(mut compiled) = compiled.try_borrow_mut(py) {
+                compiled.inner.delay_next(late_s);
+            }
+        });
+    }
+
     fn alarm(&mut self, sample: &Sample, estimate: &Estimate) -> Result<bool, Failure> {
         let Some(model_monitor) = &self.model_monitor else { return Ok(false) };
         Python::attach(|py| {
@@ -232,13 +241,14 @@ impl JointPipeline {
         motors: usize,
         flags: u32,
         stamp_ns: Option<i64>,
+        late_s: f64,
     ) -> PyResult<pipeline::Tick> {
         let results = {
             let Ok(mut driver) = self.driver.try_lock() else {
                 return Err(PyRuntimeError::new_err("two threads feed one joint"));
             };
             driver.motors = motors;
-            pipeline::estimate(&mut *driver, sample, flags).map_err(to_python)?
+            pipeline::estimate(&mut *driver, sample, flags, late_s).map_err(to_python)?
         };
         self.history.get().push(*sample, motors);
         Ok(lock(&self.state).take(sample, motors, results, stamp_ns))
@@ -322,17 +332,24 @@ impl JointPipeline {
         sample_object(py, &sample, motors).map(Some)
     }
 
-    #[pyo3(signature = (cob_id, data, jump = 1, stamp_ns = 0))]
-    fn feed(&self, cob_id: u32, data: &[u8], jump: i64, stamp_ns: i64) -> PyResult<Option<Tick>> {
+    #[pyo3(signature = (cob_id, data, jump = 1, stamp_ns = 0, late_ns = 0))]
+    fn feed(
+        &self,
+        cob_id: u32,
+        data: &[u8],
+        jump: i64,
+        stamp_ns: i64,
+        late_ns: i64,
+    ) -> PyResult<Option<Tick>> {
         let (due, motors) = {
             let mut assembler = lock(&self.assembler.get().core);
-            let due = lock(&self.state).feed(&mut assembler, cob_id, data, jump, stamp_ns);
+            let due = lock(&self.state).feed(&mut assembler, cob_id, data, jump, (stamp_ns, late_ns));
             (due, assembler.motors())
         };
         match due {
             None => Ok(None),
-            Some(Due::Sample(sample, flags)) => {
-                self.run(&sample, motors, flags, None).map(|core| Some(Tick { core }))
+            Some(Due::Sample(sample, flags, late_s)) => {
+                self.run(&sample, motors, flags, None, late_s).map(|core| Some(Tick { core }))
             }
             Some(Due::Missed(sequence, flags)) => Ok(self.carry_on(sequence, flags, None)),
         }
@@ -372,10 +389,10 @@ impl JointPipeline {
         Ok(sequence)
     }
 
-    #[pyo3(signature = (sample, flags = 0, stamp_ns = 0))]
-    fn take(&self, sample: &Bound<'_, PyAny>, flags: u32, stamp_ns: i64) -> PyResult<Tick> {
+    #[pyo3(signature = (sample, flags = 0, stamp_ns = 0, late_ns = 0))]
+    fn take(&self, sample: &Bound<'_, PyAny>, flags: u32, stamp_ns: i64, late_ns: i64) -> PyResult<Tick> {
         let (sample, motors) = sample_from(sample)?;
-        Ok(Tick { core: self.run(&sample, motors, flags, Some(stamp_ns))? })
+        Ok(Tick { core: self.run(&sample, motors, flags, Some(stamp_ns), late_ns as f64 * 1e-9)? })
     }
 
     #[pyo3(signature = (sequence, flags = 0, stamp_ns = None))]

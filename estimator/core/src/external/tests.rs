@@ -53,7 +53,7 @@ fn a_load_on_a_link_that_turns_one_way_is_not_taken_for_its_friction() {
     let carried = Carried { torque: load, stiffness: 35.0, ..Carried::default() };
     let mut external = External::nothing(0);
     for k in 1..20_000_u64 {
-        momentum.feed(speed * k as f64 * T, Some(load), f64::NAN);
+        momentum.feed(speed * k as f64 * T, Some(load), f64::NAN, 0.0);
         external = momentum.conclude(k, &carried, 1e-10, k > 200); // after the jump to this speed
     }
     assert!(external.status & status::VALID != 0);
@@ -70,13 +70,13 @@ fn a_push_on_a_free_link_rises_as_its_filter_does() {
     momentum.reset();
     momentum.restart(0.0, 0.0);
     for _ in 0..200 {
-        momentum.feed(0.0, Some(0.0), f64::NAN);
+        momentum.feed(0.0, Some(0.0), f64::NAN, 0.0);
     }
     let (push, w) = (2.0, settings.external_bandwidth);
     let mut found = None;
     for k in 1..60 {
         let t = f64::from(k) * T;
-        momentum.feed(0.5 * push / FREE.inertia * t * t, Some(0.0), f64::NAN);
+        momentum.feed(0.5 * push / FREE.inertia * t * t, Some(0.0), f64::NAN, 0.0);
         let external = momentum.conclude(k as u64, &Carried::default(), 1e-14, true);
         let x = w * t;
         let expected = push * (1.0 - (-x).exp() * (1.0 + x + 0.5 * x * x));
@@ -99,7 +99,7 @@ fn an_external_torque_that_is_measured_leaves_no_difference() {
         let t = f64::from(k) * T;
         let push = 3.0 * (20.0 * t).sin();
         let q = 3.0 / FREE.inertia * (t / 20.0 - (20.0 * t).sin() / 400.0);
-        momentum.feed(q, Some(0.0), push);
+        momentum.feed(q, Some(0.0), push, 0.0);
         let external = momentum.conclude(k as u64, &Carried::default(), 1e-14, true);
         assert!(external.difference.abs() < 2e-3, "{k}: {}", external.difference);
     }
@@ -129,4 +129,27 @@ fn the_papers_external_residual_obeys_equation_13() {
             assert!((external.link_torque - expected).abs() < 1e-9, "{k}");
         }
     }
+}
+
+#[test]
+fn a_late_sample_is_no_push_and_a_push_beside_it_is_found() {
+    // A link that swings freely at 6 rad/s; every 50th sample is 0.3 periods late.
+    let contacts = |told: bool, push: f64| {
+        let settings = Settings { contact_torque: Some(0.5), ..Settings::default() };
+        let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &PRIORS, T).unwrap();
+        momentum.reset();
+        momentum.restart(0.0, 0.0);
+        let (speed, begin) = (6.0, 1.0);
+        (1..1500_u64).any(|k| {
+            let late = if k % 50 == 0 { 0.3 * T } else { 0.0 };
+            let t = k as f64 * T + late;
+            let pushed = 0.5 * push / FREE.inertia * (t - begin).max(0.0).powi(2);
+            momentum.feed(speed * t + pushed, Some(0.0), f64::NAN, if told { late } else { 0.0 });
+            let external = momentum.conclude(k, &Carried::default(), 1e-14, k > 200);
+            external.status & status::CONTACT != 0
+        })
+    };
+    assert!(contacts(false, 0.0));
+    assert!(!contacts(true, 0.0));
+    assert!(contacts(true, 3.0));
 }

@@ -13,19 +13,17 @@ from typing import TYPE_CHECKING, Any
 from drivelink import jointfile, recording
 from drivelink.errors import HarmfulModelError, RecordingError, UsageError
 from drivelink.files import check_target
-from drivelink.jointfile import JointText, apply_diagnosis, effect_entry, link_entry
+from drivelink.jointfile import JointText, apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import floor_entry
+from drivelink.output import fitreport, plots, report, sentences
 from drivelink.output import motion as motions
-from drivelink.output import plots, report
 from drivelink.output.comparison import beside
 from drivelink.output.document import Section
-from drivelink.output.fitreport import fit_plot
 from drivelink.output.numbers import Units
 from drivelink.recording.columns import parse_column_map
-from drivelink.recording.gate import gate
+from drivelink.recording.corrections import gate
 from drivelink.recording.mapping import joint_of
 from drivelink.version import __version__
-from estimator.batch import TransmissionFit
 from estimator.diagnosis import Diagnosis
 from estimator.diagnosis import diagnose as _diagnose
 from estimator.diagnosis.motion import NextMotion, design
@@ -33,7 +31,6 @@ from estimator.diagnosis.shape import Limits
 from estimator.errors import EstimatorError
 from estimator.freerun import FreeRun, free_run
 from estimator.identify import Identified, identify
-from estimator.model import Motor
 from estimator.model_monitor import harm
 from estimator.sample import Record
 from estimator.transmissions import RIGID
@@ -126,7 +123,7 @@ class Fit:
         Raises:
             UsageError: every transmission is rigid.
         """
-        return Picture(fit_plot(self.found.fits, self.runs.source.joint))
+        return Picture(fitreport.fit_plot(self.found.fits, self.runs.source.joint))
 
     def write(self, target: str | Path, *, force: bool = False) -> Path:
         """Write a copy of the joint file with the fitted numbers.
@@ -192,21 +189,7 @@ class Fit:
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of fit.json."""
-        found = self.found
-        pairs = zip(found.fits, found.model.motors, strict=True)
-        document: dict[str, Any] = {"transmissions": [_entry(one, motor) for one, motor in pairs]}
-        if link := link_entry(found.model):
-            document["link"] = link
-        if found.link_std:
-            document["link_std"] = found.link_std
-        if len(self.runs.paths) > 1:
-            document["recordings"] = [
-                {"recording": path.name, "train": one.train._asdict(), "validation": one.validation._asdict()}
-                for path, one in zip(self.runs.paths, found.recordings, strict=True)
-            ]
-        if notes := [*self.runs.notes, *found.notes]:
-            document["notes"] = notes
-        return document
+        return fitreport.as_json(self.found, [path.name for path in self.runs.paths], self.runs.notes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +203,7 @@ class Diagnosed:
     motion: NextMotion | None = None  # the one to record next, if it was asked for
 
     def __str__(self) -> str:
-        return report.sentence(self.outcome)
+        return sentences.sentence(self.outcome)
 
     @property
     def documented(self) -> Diagnosis:
@@ -409,22 +392,3 @@ def diagnose(
         raise RecordingError(f"{runs.named}: {error}") from error
     validated = None if validation is None else Path(validation).name
     return Diagnosed(replace(runs, notes=told), outcome, validated, held)
-
-
-def _entry(one: TransmissionFit, motor: Motor) -> dict[str, Any]:
-    entry: dict[str, Any] = {"model": one.model, "parameters": one.parameters, "std": one.std}
-    std = one.nuisance_std
-    entry["motor"] = {
-        "inertia_kg_m2": motor.inertia_kg_m2,
-        "viscous_damping_nm_s_rad": motor.viscous_damping_nm_s_rad,
-        "inertia_std_kg_m2": std["inertia"],
-        "viscous_damping_std_nm_s_rad": std["damping"],
-    }
-    if motor.effects:
-        entry["effects"] = [effect_entry(effect) for effect in motor.effects]
-    entry["error_rms_nm"] = one.error_rms_nm
-    entry["error_relative"] = one.error_rms_nm / one.torque_rms_nm
-    if one.model != RIGID:
-        entry["unmodelled"] = {"coulomb_nm": one.coulomb_nm, "offset_nm": one.offset_nm}
-        entry["excited"] = one.excited
-    return entry

@@ -10,7 +10,7 @@ import diagnosiskit as kit
 import numpy as np
 import pytest
 
-from drivelink.output.report import sentence
+from drivelink.output.sentences import sentence
 from estimator.diagnosis import Diagnosis, Errors, Finding, diagnose
 from estimator.diagnosis.curves import _bases
 from estimator.diagnosis.heldout import Held

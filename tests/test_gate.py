@@ -21,7 +21,7 @@ import pytest
 from drivelink import jointfile, recording
 from drivelink.cli import main
 from drivelink.jointfile import parse
-from drivelink.recording.gate import corrections
+from drivelink.recording.corrections import corrections
 from estimator import JointModel, Motor, Record, Transmission
 from estimator.gate import Change, Discrepancy, examine, judge
 

@@ -21,8 +21,8 @@ from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import ZenohSection, load
 from drivelink.recording import read
 from drivelink.recording.canlog import read_frames
+from drivelink.recording.corrections import Gathered
 from drivelink.recording.formats import open_sink
-from drivelink.recording.gate import Gathered
 from drivelink.recording.mapping import joint_of, side_file
 from drivelink.recording.mcapfile import message_fields, read_messages
 from drivelink.recording.playback import open_playback

@@ -19,7 +19,7 @@ from drivelink.pubsub.session import close_session, open_session
 from drivelink.recording import read
 from drivelink.recording.canframes import is_frame_log
 from drivelink.recording.columns import parse_column_map
-from drivelink.recording.gate import Gathered, gate
+from drivelink.recording.corrections import Gathered, gate
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.outputs import EstimatesFile, Publication, Summary
 from drivelink.recording.playback import Playback, Played, open_playback

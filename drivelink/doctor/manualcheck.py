@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 from drivelink.jointfile import JointFile
-from drivelink.recording.gate import corrections
+from drivelink.recording.corrections import corrections
 from estimator.gate import Change
 
 _STILL = 0.1  # of the requested motion: a channel that moves less did not follow

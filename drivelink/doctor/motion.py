@@ -15,7 +15,7 @@ from drivelink.canopen.node import NodeSurvey
 from drivelink.doctor.livevalues import Readings
 from drivelink.doctor.report import Section
 from drivelink.jointfile import JointFile
-from drivelink.recording.gate import corrections
+from drivelink.recording.corrections import corrections
 from estimator.errors import EstimatorError
 from estimator.gate import Judgement, check, judge
 from estimator.sample import Record

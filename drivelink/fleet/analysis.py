@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drivelink.jointfile import JointFile, plain_parameters
-from drivelink.output import report
+from drivelink.output import report, sentences
 from estimator.batch import TransmissionFit
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.identify import identify
@@ -55,7 +55,7 @@ def analyse(
     document = report.as_json(outcome)
     shared = {
         "verdict": outcome.verdict,
-        "sentence": report.sentence(outcome),
+        "sentence": sentences.sentence(outcome),
         "effects": _names(outcome),
         "details": json.dumps({key: document[key] for key in ("effects", "alignment", "notes")}),
         **{f"error_{name}": value for name, value in outcome.validation._asdict().items()},

@@ -239,7 +239,7 @@ def _local(settings: Settings, tasks: int) -> Iterator[Client]:
             memory_limit=settings.limit_bytes or "auto",
             dashboard_address="127.0.0.1:0",  # any port; without routes
             silence_logs=logging.CRITICAL,
-            preload=["drivelink.fleet.undisturbed"],
+            preload=["drivelink.fleet.task"],
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):

@@ -6,6 +6,7 @@ import csv
 import logging
 import math
 import re
+import signal
 import socket
 import tempfile
 import time
@@ -28,9 +29,9 @@ from drivelink.output.report import Title
 from drivelink.recording.canframes import FrameLog, is_frame_log
 from drivelink.recording.canlog import CAN_SUFFIXES, read_frames
 from drivelink.recording.columns import column_map, sample_columns, sample_row
+from drivelink.recording.corrections import gate
 from drivelink.recording.cycles import Cycle
 from drivelink.recording.formats import FORMATS
-from drivelink.recording.gate import gate
 from drivelink.recording.mcapfile import read_messages, recorded_cycles
 from estimator.errors import EstimatorError
 from estimator.sample import Record
@@ -42,6 +43,11 @@ _EXPANSION_TEXT, _EXPANSION_OTHER = 30.0, 100.0
 _BASE_BYTES = 550 << 20  # memory of a worker without a recording: interpreter, libraries, Dask, caches
 _LEAST_BYTES = 64 << 20  # minimum for a part, which must contain enough motion
 _USED = 0.7  # share of the limit that is used: Dask pauses a worker at 0.8 and ends it at 0.95
+
+
+def dask_setup(worker: object) -> None:
+    """Leave a terminal's Ctrl-C to the client, which ends local workers in order; Dask calls it in them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class Piece(NamedTuple):

@@ -142,10 +142,7 @@ class MotorSection(_Section):
 
     inertia_kg_m2: float = Field(gt=0, description="B of eqs 5, 7, joint side")
     inertia_std_relative: float | None = Field(
-        None,
-        gt=0,
-        le=1,
-        description="relative standard deviation of the inertia; default 0.05",
+        None, gt=0, le=1, description="relative standard deviation of the inertia; default 0.05"
     )
     viscous_damping_nm_s_rad: float = Field(0.0, ge=0, description="D_theta of eqs 5, 7, joint side")
     viscous_damping_std_nm_s_rad: float | None = Field(
@@ -367,12 +364,8 @@ class JointFile(_Section):
                 f"motor: expected {expected} [[motor]] with "
                 f'arrangement = "{self.arrangement}", got {len(self.motor)}'
             )
-        nodes = [m.drive.node_id for m in self.motor if m.drive]
-        if (
-            self.link.encoder
-            and self.link.encoder.source == "cia406"
-            and self.link.encoder.node_id is not None
-        ):
+        nodes: list[int | None] = [m.drive.node_id for m in self.motor if m.drive]
+        if self.link.encoder and self.link.encoder.source == "cia406":
             nodes.append(self.link.encoder.node_id)
         twice = {node for node in nodes if nodes.count(node) > 1}
         if twice:

@@ -22,7 +22,7 @@ from drivelink.jointfile import JointFile, apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from drivelink.loop import finding
 from drivelink.loop.finding import page_file, proposal_file
-from drivelink.output import report
+from drivelink.output import report, sentences
 from drivelink.output.numbers import Units
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
@@ -50,20 +50,20 @@ def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
     fall = f"{error.before_relative:.2%} to {error.after_relative:.2%}"
     on = "on held-out data the error of the motor torque"
     if outcome.verdict == "effect":
-        names = " and ".join(report.title_of(one, outcome) for one in outcome.effects)
-        sentence, short = f"{report.lacks(outcome)}: {on} falls from {fall}.", f"{names}, error {fall}"
+        names = " and ".join(sentences.title_of(one, outcome) for one in outcome.effects)
+        sentence, short = f"{sentences.lacks(outcome)}: {on} falls from {fall}.", f"{names}, error {fall}"
     elif outcome.verdict == "sufficient" and error.after_rms_nm < 0.5 * error.before_rms_nm:
         sentence = f"No effect is missing, but the joint has changed: refitted, {on} falls from {fall}."
         short = f"the joint has changed, error {fall}"
     else:
-        sentence = report.sentence(outcome)
+        sentence = sentences.sentence(outcome)
         short = sentence.partition(":")[0].rstrip(".")
     return Summary(sentence, short, tuple(_parameters(outcome, joint, units)))
 
 
 def _parameters(outcome: Diagnosis, joint: JointFile, units: Units) -> list[str]:
     lines = [
-        f"{report.title_of(one, outcome)}: {name} = {units.value(name, value, one.std.get(name))}"
+        f"{sentences.title_of(one, outcome)}: {name} = {units.value(name, value, one.std.get(name))}"
         for one in outcome.effects
         for name, value in one.parameters.items()
     ]

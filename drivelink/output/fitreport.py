@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -10,13 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drivelink.errors import UsageError
-from drivelink.jointfile import JointFile, link_entry
+from drivelink.jointfile import JointFile, effect_entry, link_entry
 from drivelink.output import plots
 from drivelink.output.document import PARAMETER_HEAD, Grid, Lines, Section, Share, parameter_rows
 from drivelink.output.numbers import Units, bare_name, number
 from estimator.batch import TransmissionFit
 from estimator.identify import Identified
-from estimator.model import Effect
+from estimator.model import Effect, Motor
 from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import MODELS, RIGID
 
@@ -25,6 +26,48 @@ _WIDTH, _HEIGHT = 10.0, 7.0  # inches of a transmission
 _IN_BIN = 15  # rows per median point of the lines through the residuals
 _SHOWN = 3  # parameters beside the curve
 _Rows = list[tuple[str | Share, ...]]
+
+
+def as_json(found: Identified, names: Sequence[str], notes: Iterable[str]) -> dict[str, Any]:
+    """Return the content of fit.json.
+
+    Args:
+        names: of the recordings.
+        notes: what the gate says of them.
+    """
+    pairs = zip(found.fits, found.model.motors, strict=True)
+    document: dict[str, Any] = {"transmissions": [_entry(one, motor) for one, motor in pairs]}
+    if link := link_entry(found.model):
+        document["link"] = link
+    if found.link_std:
+        document["link_std"] = found.link_std
+    if len(names) > 1:
+        document["recordings"] = [
+            {"recording": name, "train": one.train._asdict(), "validation": one.validation._asdict()}
+            for name, one in zip(names, found.recordings, strict=True)
+        ]
+    if notes := [*notes, *found.notes]:
+        document["notes"] = notes
+    return document
+
+
+def _entry(one: TransmissionFit, motor: Motor) -> dict[str, Any]:
+    entry: dict[str, Any] = {"model": one.model, "parameters": one.parameters, "std": one.std}
+    std = one.nuisance_std
+    entry["motor"] = {
+        "inertia_kg_m2": motor.inertia_kg_m2,
+        "viscous_damping_nm_s_rad": motor.viscous_damping_nm_s_rad,
+        "inertia_std_kg_m2": std["inertia"],
+        "viscous_damping_std_nm_s_rad": std["damping"],
+    }
+    if motor.effects:
+        entry["effects"] = [effect_entry(effect) for effect in motor.effects]
+    entry["error_rms_nm"] = one.error_rms_nm
+    entry["error_relative"] = one.error_rms_nm / one.torque_rms_nm
+    if one.model != RIGID:
+        entry["unmodelled"] = {"coulomb_nm": one.coulomb_nm, "offset_nm": one.offset_nm}
+        entry["excited"] = one.excited
+    return entry
 
 
 def sections(found: Identified, names: Sequence[str], units: Units) -> list[Section]:

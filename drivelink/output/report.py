@@ -28,6 +28,7 @@ from drivelink.output.document import (
     parameter_rows,
 )
 from drivelink.output.numbers import Units, in_words
+from drivelink.output.sentences import SURE, free_curve, others_of, sentence, title_of, unexplained
 from estimator.choices import choice
 from estimator.diagnosis import Curve, Diagnosis, Finding, StiffnessCurve
 from estimator.effects import LIBRARY
@@ -36,7 +37,6 @@ from estimator.sample import SIGMA_95
 _SCHEMA = "drivelink.diagnosis/1"
 _CURVE_POINTS = 200
 _RIVALS = 8
-_SURE, _LIKELY = 0.9, 0.3  # probabilities at which an effect is missing, and at which it has a name
 _COLUMN = 4.6  # inches of a plot in half the page, or on a phone
 _LIBRARY_NAME = re.compile(rf"\b({'|'.join(LIBRARY)})\b")
 _AXES = {
@@ -76,7 +76,7 @@ def write(document: Mapping[str, Any], html: str, folder: Path) -> list[Path]:
 
 def as_json(outcome: Diagnosis) -> dict[str, Any]:
     """Return the content of report.json."""
-    unlisted = _curve_of_unlisted(outcome)
+    unlisted = free_curve(outcome)
     return {
         "schema": _SCHEMA,
         "verdict": outcome.verdict,
@@ -96,10 +96,6 @@ def as_json(outcome: Diagnosis) -> dict[str, Any]:
         "advice": list(outcome.advice),
         "notes": list(outcome.notes),
     }
-
-
-def _curve_of_unlisted(outcome: Diagnosis) -> Curve | None:
-    return next((c for c in outcome.curves if c.name == "unlisted"), None)
 
 
 def _effect(finding: Finding, unlisted: Curve | None) -> dict[str, Any]:
@@ -132,86 +128,6 @@ def _points(curve: Curve) -> dict[str, list[float]]:
     return {**points, "torque_nm": curve.fitted_nm[pick].tolist()}
 
 
-def sentence(outcome: Diagnosis) -> str:
-    """Return the verdict in one sentence."""
-    error, held = "the torque balance's error on held-out data", outcome.validation
-    lower = held.after_rms_nm <= held.before_rms_nm
-    moves = "falls" if lower else "rises"
-    fall = f"{error} {moves} from {held.before_relative:.2%} to {held.after_relative:.2%}"
-    if outcome.verdict == "effect":
-        return f"{lacks(outcome)}: {fall}."
-    names = " and ".join(title_of(finding, outcome) for finding in outcome.effects)
-    if outcome.verdict == "unexplained":
-        where = outcome.effects[0]
-        place = _place(where, outcome)
-        over = " and ".join(name.replace("_", " ") for name in where.coordinates)
-        by = "a free curve" if _curve_of_unlisted(outcome) else "what was tried"
-        return f"The model lacks something at the {place} that is not in the library" + (
-            f", a function of {over}: with {by} {fall}."
-            if lower
-            else f", and {by} over {over} does not lower {error}, {held.before_relative:.2%}."
-        )
-    if outcome.verdict == "insufficient_excitation":
-        said = f" (it might be {names})" if names else ""
-        return f"The motion does not reveal what could be missing{said}: record a richer one."
-    return (
-        f"The model is sufficient: what it leaves, {outcome.validation.after_relative:.2%} of the torque, "
-        "belongs to no effect."
-    )
-
-
-def lacks(outcome: Diagnosis) -> str:
-    """Return what is missing, said as surely as it is known."""
-    sure = [title_of(f, outcome) for f in outcome.effects if f.probability >= _SURE]
-    likely = [
-        f"{title_of(f, outcome)} ({f.probability:.2f})" + (f", else {others_of(f)}" if f.alternatives else "")
-        for f in outcome.effects
-        if _LIKELY <= f.probability < _SURE
-    ]
-    unsure = sorted({_place(f, outcome) for f in outcome.effects if f.probability < _LIKELY})
-    said = []
-    if sure:
-        said.append(f"The model lacks {' and '.join(sure)}")
-    if likely:
-        said.append(f"most likely {'' if sure else 'the model lacks '}{' and '.join(likely)}")
-    if unsure:
-        to_do = outcome.advice[0] if outcome.advice else "record another motion, faster, slower and wider"
-        said.append(f"something at the {' and '.join(unsure)} has no likely name yet ({to_do})")
-    text = "; ".join(said)
-    return text[0].upper() + text[1:]
-
-
-def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
-    """Return the remaining error in one sentence."""
-    unit = (units or Units(False)).shown("N·m")
-    left = outcome.validation
-    text = f"{left.after_relative:.2%} of the torque ({left.after_rms_nm:.3g} {unit} rms) stays unexplained"
-    if outcome.verdict == "unexplained":
-        return f"{text} even with the free curve, which has no name in the library."
-    if outcome.verdict == "insufficient_excitation":
-        return f"{text}; this motion does not reveal whether anything is missing."
-    return f"{text}: noise, or effects too small to be separated from it in these data."
-
-
-def title_of(finding: Finding, outcome: Diagnosis) -> str:
-    """Return an effect in words, with its place."""
-    if finding.name == "unlisted":
-        return f"an unlisted effect at the {_place(finding, outcome)}"
-    return f"{in_words(finding.name)} ({_place(finding, outcome)})"
-
-
-def others_of(finding: Finding) -> str:
-    """Return the alternatives of an effect, with their probabilities."""
-    pairs = zip(finding.alternatives, finding.alternative_probabilities, strict=True)
-    return ", ".join(f"{in_words(name)} ({p:.2f})" for name, p in pairs)
-
-
-def _place(finding: Finding, outcome: Diagnosis) -> str:
-    """Its location, with the motor's number where there are two."""
-    several = len(outcome.transmissions) > 1 and finding.motor is not None
-    return f"{finding.location} {(finding.motor or 0) + 1}" if several else finding.location
-
-
 def html_page(outcome: Diagnosis, title: Title, more: Sequence[Section] = ()) -> str:
     """Draw the report as one self-contained page; `more` follows what was found."""
     about = (
@@ -226,7 +142,7 @@ def html_page(outcome: Diagnosis, title: Title, more: Sequence[Section] = ()) ->
 
 def sections(outcome: Diagnosis, units: Units) -> list[Section]:
     """Describe and draw what was found, for a page and for a terminal."""
-    sure = all(finding.probability >= _SURE for finding in outcome.effects)
+    sure = all(finding.probability >= SURE for finding in outcome.effects)
     label = f"{'' if sure else 'likely '}{outcome.verdict.replace('_', ' ')}"
     verdict = Paragraph(sentence(outcome), label, f"verdict {outcome.verdict}")
     wide = max(len(outcome.curves), len(outcome.stiffness)) > 1

@@ -8,13 +8,17 @@
 //! No clock is read here: the same frames in the same order give the same samples, live or from a log. The
 //! caller, who has the stamps, gives the number of periods since the last SYNC.
 
+mod arrange;
+mod compare;
+#[cfg(test)]
+mod tests;
+
 use estimator_core::sample::{MOTORS, Sample};
 
-use crate::cross_check::{CrossCheck, Kind, spoils};
-use crate::frames::{TpdoDecoder, target};
-use crate::layout::{self, Signal};
+use crate::cross_check::CrossCheck;
+use crate::frames::TpdoDecoder;
 use crate::node::Node;
-use crate::status::{BUS_FAULT, CONTRADICTED, DRIVE_FAULT, NODE_RESTARTED, UNTIMED};
+use crate::status::{BUS_FAULT, DRIVE_FAULT, NODE_RESTARTED, UNTIMED};
 
 /// Identifier of SYNC.
 pub const SYNC_COB_ID: u32 = 0x080;
@@ -29,7 +33,7 @@ const MOST_OWED: u32 = 10;
 /// Cycles after a missing frame or a SYNC too many in which what comes may be one period late.
 const DOUBT_CYCLES: u32 = 100;
 
-/// Values of a joint, at most, see [`target`].
+/// Values of a joint, at most, see [`crate::frames::target`].
 const VALUES: usize = 8 * MOTORS + 2;
 
 /// Who wants the frames of an identifier.
@@ -76,75 +80,10 @@ pub struct Assembler {
 }
 
 impl Assembler {
-    /// The assembler of a joint with so many motors.
-    ///
-    /// `active`: whether we configure the nodes. Then a node that rebooted is believed again when it is started again;
-    /// else `trust` alone makes it so. `hold_periods`: how long the last value of a TPDO that is not
-    /// sent on SYNC may be used while nothing at all is heard of its node; and how long one that is sent on SYNC may
-    /// fail before its node may have started anew unheard: positions may count from elsewhere then, and a node that we
-    /// configure is not believed any more.
-    /// `period_s`: communication cycle.
-    ///
-    /// # Errors
-    /// Two frames with one identifier, or a motor without position or torque.
-    pub fn new(
-        layouts: &[layout::Node],
-        motors: usize,
-        active: bool,
-        hold_periods: i64,
-        period_s: f64,
-    ) -> Result<Assembler, String> {
-        if motors > MOTORS {
-            return Err(format!("expected at most {MOTORS} motors, got {motors}"));
-        }
-        let mut assembler = Assembler {
-            motors,
-            active,
-            hold_periods,
-            values: [f64::NAN; VALUES],
-            answered: [-1; VALUES],
-            period: period_s,
-            checks: Vec::new(),
-            nodes: Vec::new(),
-            decoders: Vec::new(),
-            receivers: Vec::new(),
-            open: false,
-            spoiled: false,
-            cycle_fault: false,
-            restart: false,
-            unnumbered: false,
-            faulted: 0,
-            contradicted: 0,
-            misread: 0,
-            untimed: 0,
-            awaited: 0,
-            sequence: -1,
-            missed: None,
-            flags: 0,
-        };
-        for layout in layouts {
-            if !assembler.nodes.iter().any(|node| node.node_id == layout.node_id) {
-                assembler.nodes.push(Node::new(layout.node_id, active));
-            }
-            assembler.add(layout)?;
-        }
-        assembler.check()?;
-        assembler.arrange();
-        assembler.arrange_checks();
-        Ok(assembler)
-    }
-
     /// How many motors the joint has.
     #[must_use]
     pub fn motors(&self) -> usize {
         self.motors
-    }
-
-    /// Identifiers that concern this joint, SYNC aside.
-    pub fn cob_ids(&self) -> impl Iterator<Item = u32> + '_ {
-        (0u32..).zip(&self.receivers).filter_map(|(cob_id, receiver)| {
-            (*receiver != Receiver::Nobody && *receiver != Receiver::Sync).then_some(cob_id)
-        })
     }
 
     /// The joint's nodes.
@@ -157,12 +96,6 @@ impl Assembler {
     #[must_use]
     pub fn checks(&self) -> &[CrossCheck] {
         &self.checks
-    }
-
-    /// Whether any frame carries the link position.
-    #[must_use]
-    pub fn has_link(&self) -> bool {
-        self.carries(3 * self.motors)
     }
 
     /// Whether this cycle has given its sample: nothing more is expected before the next SYNC.
@@ -438,162 +371,6 @@ impl Assembler {
         }
     }
 
-    /// From now on `trust` alone makes a node believed again: somebody else may start it too.
-    pub fn supervise(&mut self) {
-        for node in &mut self.nodes {
-            node.supervised = true;
-        }
-    }
-
-    /// Do not use what a node sends until it is started again.
-    pub fn distrust(&mut self, node_id: u32) {
-        for node in self.nodes.iter_mut().filter(|node| node.node_id == node_id) {
-            node.trusted = false;
-        }
-    }
-
-    /// A node says by SDO what its frames do not, or does no longer.
-    pub fn contradict(&mut self, node_id: u32, contradicted: bool) {
-        for node in self.nodes.iter_mut().filter(|node| node.node_id == node_id) {
-            node.contradicted = contradicted;
-        }
-        let any = self.nodes.iter().any(|node| node.contradicted);
-        self.misread = if any { CONTRADICTED } else { 0 };
-    }
-
-    /// A node has been configured and started.
-    pub fn trust(&mut self, node_id: u32) {
-        if let Some(node) = self.nodes.iter().position(|node| node.node_id == node_id) {
-            let (node, decoders) = self.node_and_decoders(node);
-            node.trust(decoders);
-        }
-    }
-
-    /// A node has been configured differently: from now on its frames are read by this layout.
-    ///
-    /// # Errors
-    /// As for `new`; then everything is as it was.
-    pub fn relayout(&mut self, layout: &layout::Node) -> Result<(), String> {
-        let before = self.decoders.clone();
-        self.decoders.retain(|decoder| self.nodes[decoder.node].node_id != layout.node_id);
-        let changed = self.add(layout).and_then(|()| self.check());
-        match changed {
-            Ok(()) => self.restart = true, // what is decoded anew may jump
-            Err(_) => self.decoders = before,
-        }
-        self.arrange();
-        self.arrange_checks();
-        changed
-    }
-
-    fn add(&mut self, layout: &layout::Node) -> Result<(), String> {
-        let node_id = layout.node_id;
-        let Some(node) = self.nodes.iter().position(|node| node.node_id == node_id) else {
-            return Err(format!("node {node_id}: expected a node of this joint"));
-        };
-        for tpdo in &layout.tpdos {
-            if self.decoders.iter().any(|decoder| decoder.cob_id == tpdo.cob_id) {
-                return Err(format!("node {node_id}: COB-ID 0x{:03X} is used by two TPDOs", tpdo.cob_id));
-            }
-            self.decoders.push(TpdoDecoder::new(tpdo, node, layout.motor, self.motors));
-        }
-        Ok(())
-    }
-
-    fn check(&self) -> Result<(), String> {
-        for motor in 0..self.motors {
-            for (target, what) in [(motor, "position"), (2 * self.motors + motor, "torque")] {
-                if !self.carries(target) {
-                    return Err(format!("motor {}: no TPDO carries its {what}", motor + 1));
-                }
-            }
-        }
-        Ok(())
-    }
-
-    fn carries(&self, target: usize) -> bool {
-        self.decoders.iter().flat_map(|decoder| &decoder.fields).any(|field| field.target == target)
-    }
-
-    fn arrange(&mut self) {
-        self.receivers.clear();
-        self.receivers.resize(COB_IDS, Receiver::Nobody);
-        self.receivers[0] = Receiver::Command;
-        for (node, of) in self.nodes.iter().enumerate() {
-            self.receivers[(0x700 + of.node_id as usize) % COB_IDS] = Receiver::Heartbeat(node);
-            self.receivers[(0x080 + of.node_id as usize) % COB_IDS] = Receiver::Error(node);
-            self.receivers[(0x600 + of.node_id as usize) % COB_IDS] = Receiver::Request(node);
-        }
-        self.receivers[SYNC_COB_ID as usize] = Receiver::Sync;
-        for (decoder, of) in self.decoders.iter().enumerate() {
-            self.receivers[of.cob_id as usize % COB_IDS] = Receiver::TpdoDecoder(decoder);
-        }
-        self.awaited = self.decoders.iter().filter(|decoder| decoder.timed() && !decoder.arrived).count();
-    }
-
-    /// Which readings of one quantity are mapped.
-    fn arrange_checks(&mut self) {
-        let fields: Vec<(usize, f64)> = self
-            .decoders
-            .iter()
-            .flat_map(|decoder| &decoder.fields)
-            .map(|field| (field.target, field.scale))
-            .collect();
-        self.checks.clear();
-        self.contradicted = 0;
-        for motor in 0..self.motors {
-            let step = |signal| {
-                let place = target(signal, Some(motor), self.motors);
-                fields.iter().find(|(target, _)| Some(*target) == place).map(|(_, scale)| *scale)
-            };
-            let (position, torque) = (step(Signal::MotorPosition), step(Signal::MotorTorque));
-            let velocity = step(Signal::MotorVelocity).or(step(Signal::VelocityCheck));
-            let demand = step(Signal::PositionDemand).and(position);
-            for (kind, first, second) in [
-                (Kind::Velocity, position, velocity),
-                (Kind::Current, torque, step(Signal::TorqueCheck)),
-                (Kind::SecondEncoder, position, step(Signal::SecondPosition)),
-                (Kind::FollowingError, demand, step(Signal::FollowingError)),
-            ] {
-                if let (Some(first), Some(second)) = (first, second) {
-                    self.checks.push(CrossCheck::new(kind, motor, (first, second), self.period));
-                }
-            }
-        }
-    }
-
-    /// Hold the readings of the cycle that ends against each other, where all of them are of it.
-    fn cross_check(&mut self) {
-        if self.checks.is_empty() || self.open || self.spoiled || self.untimed > 0 || self.sequence < 0 {
-            return;
-        }
-        let (motors, mut ended) = (self.motors, false);
-        for check in &mut self.checks {
-            let motor = check.motor;
-            let now = |signal| {
-                let place = target(signal, Some(motor), motors)?;
-                (self.answered[place] == self.sequence).then_some(self.values[place])
-            };
-            let position = now(Signal::MotorPosition);
-            let (first, second) = match check.kind {
-                Kind::Velocity => (position, now(Signal::MotorVelocity).or(now(Signal::VelocityCheck))),
-                Kind::Current => (now(Signal::MotorTorque), now(Signal::TorqueCheck)),
-                Kind::SecondEncoder => (position, now(Signal::SecondPosition)),
-                Kind::FollowingError => {
-                    let demand = now(Signal::PositionDemand);
-                    (demand.zip(position).map(|(demand, is)| demand - is), now(Signal::FollowingError))
-                }
-            };
-            if let (Some(first), Some(second)) = (first, second) {
-                ended |= check.take(self.sequence, first, second);
-            }
-        }
-        if ended {
-            let spoilt = (0..motors).any(|motor| spoils(&self.checks, motor));
-            self.contradicted = if spoilt { CONTRADICTED } else { 0 };
-        }
-    }
-
     fn node_and_decoders(&mut self, node: usize) -> (&mut Node, impl Iterator<Item = &mut TpdoDecoder>) {
         (&mut self.nodes[node], self.decoders.iter_mut().filter(move |decoder| decoder.node == node))
     }
@@ -606,72 +383,5 @@ impl Assembler {
             }
             self.restart |= std::mem::replace(&mut node.restarted, false);
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::layout::{MappedObject, Node as Layout, Tpdo};
-
-    fn object(signal: Signal, bits: u32, scale: f64) -> MappedObject {
-        MappedObject { signal, bits, signed: true, scale, offset: 0.0, range: 0 }
-    }
-
-    /// A drive with position and torque at 0x181, an encoder at 0x183.
-    fn assembler() -> Assembler {
-        let tpdo = |cob_id, objects| Tpdo { cob_id, objects, transmission_type: 1 };
-        let drive = [object(Signal::MotorPosition, 32, 1e-3), object(Signal::MotorTorque, 16, 0.1)];
-        let link = [object(Signal::LinkPosition, 32, 1e-3)];
-        let layouts = [
-            Layout { node_id: 1, motor: Some(0), tpdos: vec![tpdo(0x181, drive.to_vec())] },
-            Layout { node_id: 3, motor: None, tpdos: vec![tpdo(0x183, link.to_vec())] },
-        ];
-        Assembler::new(&layouts, 1, true, 250, 1e-3).unwrap()
-    }
-
-    fn drive(position: i32, torque: i16) -> Vec<u8> {
-        [&position.to_le_bytes()[..], &torque.to_le_bytes()[..]].concat()
-    }
-
-    #[test]
-    fn a_sample_is_given_with_the_last_frame_of_its_sync() {
-        let mut made = assembler();
-        assert_eq!(made.cob_ids().filter(|id| [0x181, 0x183].contains(id)).count(), 2);
-        assert!(made.has_link() && made.feed(SYNC_COB_ID, &[], 1).is_none());
-        assert!(made.feed(0x181, &drive(-1500, 20), 0).is_none());
-        let sample = made.feed(0x183, &250i32.to_le_bytes(), 0).unwrap();
-        assert_eq!((sample.sequence, sample.motor_position[0], sample.link_position), (0, -1.5, 0.25));
-        assert!((sample.motor_torque[0] - 2.0).abs() < 1e-12 && made.complete() && made.flags == 0);
-    }
-
-    #[test]
-    fn a_frame_that_does_not_come_is_a_gap_of_its_node() {
-        let mut made = assembler();
-        made.feed(SYNC_COB_ID, &[], 1);
-        made.feed(0x181, &drive(0, 0), 0);
-        assert!(made.feed(SYNC_COB_ID, &[], 1).is_none());
-        assert_eq!((made.missed, made.flags), (Some(0), BUS_FAULT));
-        assert_eq!(made.nodes().iter().map(|node| node.counters.missing).collect::<Vec<_>>(), [0, 1]);
-    }
-
-    #[test]
-    fn a_frame_of_another_length_and_frames_of_a_rebooted_node_are_not_used() {
-        let mut made = assembler();
-        made.feed(SYNC_COB_ID, &[], 1);
-        made.feed(0x181, &[1, 2, 3], 0);
-        assert_eq!(made.nodes()[0].counters.wrong_length, 1);
-        made.feed(0x701, &[0], 0);
-        made.feed(SYNC_COB_ID, &[], 1);
-        made.feed(0x181, &drive(0, 0), 0);
-        assert_eq!((made.nodes()[0].counters.reboots, made.nodes()[0].counters.ignored), (1, 1));
-    }
-
-    #[test]
-    fn a_joint_lacks_no_position_and_no_frame_has_two_senders() {
-        assert!(Assembler::new(&[], 1, true, 250, 1e-3).is_err());
-        let tpdo = Tpdo { cob_id: 0x181, objects: vec![], transmission_type: 1 };
-        let twice = Layout { node_id: 1, motor: None, tpdos: vec![tpdo.clone(), tpdo] };
-        assert!(Assembler::new(&[twice], 0, true, 250, 1e-3).is_err());
     }
 }

@@ -3,6 +3,7 @@
 mod assembler;
 mod latency;
 mod pipeline;
+mod tick;
 mod values;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -35,7 +36,9 @@ mod extension {
     #[pymodule_export]
     use super::latency::LatencyHistogram;
     #[pymodule_export]
-    use super::pipeline::{History, JointPipeline, Tick};
+    use super::pipeline::JointPipeline;
+    #[pymodule_export]
+    use super::tick::{History, Tick};
     #[pymodule_export]
     use super::values::{encode_estimate, encode_external, encode_sample};
     #[pymodule_export]

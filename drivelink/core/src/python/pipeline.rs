@@ -1,8 +1,7 @@
-//! `JointPipeline`, its cycles and its last samples.
+//! `JointPipeline`, and the estimator in it.
 //!
 //! No lock is held while Python code runs.
 
-use std::collections::VecDeque;
 use std::sync::Mutex;
 
 use estimator_core::external::External;
@@ -15,132 +14,10 @@ use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use super::assembler::Assembler;
+use super::tick::{History, Tick};
 use super::values::{ExternalFields, estimate_from, external_of, sample_from};
 use super::{lock, to_python};
 use crate::pipeline::{self, Due, Failure, Pipeline, Step};
-
-/// What is published of one cycle.
-#[pyclass(frozen, module = "drivelink._core")]
-pub(super) struct Tick {
-    core: pipeline::Tick,
-}
-
-#[pymethods]
-impl Tick {
-    #[getter]
-    fn sequence(&self) -> u64 {
-        self.core.estimate.sequence
-    }
-
-    #[getter]
-    fn status(&self) -> u32 {
-        self.core.estimate.status
-    }
-
-    #[getter]
-    fn stamp_ns(&self) -> i64 {
-        self.core.stamp_ns
-    }
-
-    #[getter]
-    fn current(&self) -> bool {
-        self.core.current
-    }
-
-    #[getter]
-    fn fresh(&self) -> bool {
-        self.core.sample.is_some()
-    }
-
-    #[getter]
-    fn estimate<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        estimate_object(py, &self.core.estimate)
-    }
-
-    #[getter]
-    fn external<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
-        self.core.external.map(|external| external_object(py, &external)).transpose()
-    }
-
-    #[getter]
-    fn sample<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
-        self.core.sample.map(|sample| sample_object(py, &sample, self.core.motors)).transpose()
-    }
-
-    fn flagged(&self, status: u32) -> Tick {
-        let mut core = self.core;
-        core.estimate.status |= status;
-        Tick { core }
-    }
-
-    fn stamped(&self, stamp_ns: i64) -> Tick {
-        Tick { core: pipeline::Tick { stamp_ns, ..self.core } }
-    }
-
-    #[getter]
-    fn estimate_payload<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
-        PyBytes::new(py, self.core.estimate_payload().bytes())
-    }
-
-    #[getter]
-    fn external_payload<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyBytes>> {
-        self.core.external_payload().map(|payload| PyBytes::new(py, payload.bytes()))
-    }
-
-    #[getter]
-    fn sample_payload<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyBytes>> {
-        self.core.sample_payload().map(|payload| PyBytes::new(py, payload.bytes()))
-    }
-}
-
-/// The last samples of a joint, for a new estimator to start from; read by another thread than the cycle's.
-#[pyclass(frozen, module = "drivelink._core")]
-pub(super) struct History {
-    keep: usize,
-    kept: Mutex<VecDeque<(Sample, usize)>>,
-}
-
-impl History {
-    fn push(&self, sample: Sample, motors: usize) {
-        if self.keep > 0 {
-            let mut kept = lock(&self.kept);
-            if kept.len() == self.keep {
-                kept.pop_front();
-            }
-            kept.push_back((sample, motors));
-        }
-    }
-
-    /// The kept samples after one of that number, the oldest `most` of them.
-    fn copied(&self, sequence: i64, most: Option<usize>) -> Vec<(Sample, usize)> {
-        let kept = lock(&self.kept);
-        let first = kept.partition_point(|(sample, _)| sample.sequence as i64 <= sequence);
-        kept.range(first..).take(most.unwrap_or(usize::MAX)).copied().collect()
-    }
-}
-
-#[pymethods]
-impl History {
-    fn __len__(&self) -> usize {
-        lock(&self.kept).len()
-    }
-
-    #[pyo3(signature = (sequence, most = None))]
-    fn after<'py>(
-        &self,
-        py: Python<'py>,
-        sequence: i64,
-        most: Option<usize>,
-    ) -> PyResult<Vec<Bound<'py, PyAny>>> {
-        let found = self.copied(sequence, most);
-        found.iter().map(|(sample, motors)| sample_object(py, sample, *motors)).collect()
-    }
-
-    fn behind(&self, sequence: i64) -> usize {
-        let kept = lock(&self.kept);
-        kept.len() - kept.partition_point(|(sample, _)| sample.sequence as i64 <= sequence)
-    }
-}
 
 /// The estimator of a pipeline, and the monitor of its model: compiled ones are called without Python in between.
 pub(super) struct Driver {
@@ -269,7 +146,7 @@ impl JointPipeline {
         let objects = (estimator.clone_ref(py), model_monitor.as_ref().map(|monitor| monitor.clone_ref(py)));
         Ok(JointPipeline {
             assembler,
-            history: Py::new(py, History { keep, kept: Mutex::new(VecDeque::with_capacity(keep)) })?,
+            history: Py::new(py, History::new(keep))?,
             state: Mutex::default(),
             driver: Mutex::new(Driver::new(py, estimator, model_monitor)),
             objects: Mutex::new(objects),

@@ -1,0 +1,94 @@
+"""Says in sentences what a diagnosis found."""
+
+from __future__ import annotations
+
+from drivelink.output.numbers import Units, in_words
+from estimator.diagnosis import Curve, Diagnosis, Finding
+
+# probabilities at which an effect is missing, and at which it has a name
+SURE, _LIKELY = 0.9, 0.3
+
+
+def free_curve(outcome: Diagnosis) -> Curve | None:
+    """Return the curve of what the library does not have, if it was fitted."""
+    return next((c for c in outcome.curves if c.name == "unlisted"), None)
+
+
+def sentence(outcome: Diagnosis) -> str:
+    """Return the verdict in one sentence."""
+    error, held = "the torque balance's error on held-out data", outcome.validation
+    lower = held.after_rms_nm <= held.before_rms_nm
+    moves = "falls" if lower else "rises"
+    fall = f"{error} {moves} from {held.before_relative:.2%} to {held.after_relative:.2%}"
+    if outcome.verdict == "effect":
+        return f"{lacks(outcome)}: {fall}."
+    names = " and ".join(title_of(finding, outcome) for finding in outcome.effects)
+    if outcome.verdict == "unexplained":
+        where = outcome.effects[0]
+        place = _place(where, outcome)
+        over = " and ".join(name.replace("_", " ") for name in where.coordinates)
+        by = "a free curve" if free_curve(outcome) else "what was tried"
+        return f"The model lacks something at the {place} that is not in the library" + (
+            f", a function of {over}: with {by} {fall}."
+            if lower
+            else f", and {by} over {over} does not lower {error}, {held.before_relative:.2%}."
+        )
+    if outcome.verdict == "insufficient_excitation":
+        said = f" (it might be {names})" if names else ""
+        return f"The motion does not reveal what could be missing{said}: record a richer one."
+    return (
+        f"The model is sufficient: what it leaves, {outcome.validation.after_relative:.2%} of the torque, "
+        "belongs to no effect."
+    )
+
+
+def lacks(outcome: Diagnosis) -> str:
+    """Return what is missing, said as surely as it is known."""
+    sure = [title_of(f, outcome) for f in outcome.effects if f.probability >= SURE]
+    likely = [
+        f"{title_of(f, outcome)} ({f.probability:.2f})" + (f", else {others_of(f)}" if f.alternatives else "")
+        for f in outcome.effects
+        if _LIKELY <= f.probability < SURE
+    ]
+    unsure = sorted({_place(f, outcome) for f in outcome.effects if f.probability < _LIKELY})
+    said = []
+    if sure:
+        said.append(f"The model lacks {' and '.join(sure)}")
+    if likely:
+        said.append(f"most likely {'' if sure else 'the model lacks '}{' and '.join(likely)}")
+    if unsure:
+        to_do = outcome.advice[0] if outcome.advice else "record another motion, faster, slower and wider"
+        said.append(f"something at the {' and '.join(unsure)} has no likely name yet ({to_do})")
+    text = "; ".join(said)
+    return text[0].upper() + text[1:]
+
+
+def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
+    """Return the remaining error in one sentence."""
+    unit = (units or Units(False)).shown("N·m")
+    left = outcome.validation
+    text = f"{left.after_relative:.2%} of the torque ({left.after_rms_nm:.3g} {unit} rms) stays unexplained"
+    if outcome.verdict == "unexplained":
+        return f"{text} even with the free curve, which has no name in the library."
+    if outcome.verdict == "insufficient_excitation":
+        return f"{text}; this motion does not reveal whether anything is missing."
+    return f"{text}: noise, or effects too small to be separated from it in these data."
+
+
+def title_of(finding: Finding, outcome: Diagnosis) -> str:
+    """Return an effect in words, with its place."""
+    if finding.name == "unlisted":
+        return f"an unlisted effect at the {_place(finding, outcome)}"
+    return f"{in_words(finding.name)} ({_place(finding, outcome)})"
+
+
+def others_of(finding: Finding) -> str:
+    """Return the alternatives of an effect, with their probabilities."""
+    pairs = zip(finding.alternatives, finding.alternative_probabilities, strict=True)
+    return ", ".join(f"{in_words(name)} ({p:.2f})" for name, p in pairs)
+
+
+def _place(finding: Finding, outcome: Diagnosis) -> str:
+    """Its location, with the motor's number where there are two."""
+    several = len(outcome.transmissions) > 1 and finding.motor is not None
+    return f"{finding.location} {(finding.motor or 0) + 1}" if several else finding.location

@@ -31,6 +31,7 @@ DOCUMENTS = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     ROOT / "benchmarks" / "README.md",
+    ROOT / "benchmarks" / "results.md",
     ROOT / "examples" / "README.md",
     *PAGES,
 ]

@@ -1,13 +1,16 @@
 """The network of devices: lockstep, served by a thread, over TCP."""
 
 import itertools
+import math
 import socket
+import sys
 import threading
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 
 import can
+import numpy as np
 import pytest
 from simkit import StubRig
 
@@ -161,6 +164,27 @@ def test_frames_pass_between_the_server_and_all_its_clients():
         assert (message.arbitration_id, message.is_extended_id) == (0x1ABCDEF0, True)
         first.shutdown()
         second.shutdown()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel's stamps")
+def test_a_frame_has_the_time_of_its_arrival_however_late_it_is_read():
+    """The drives of a loaded machine answer late, but for the moment of the SYNC: the world is not a period ahead."""
+    with SocketcandServer("vcan0", port=0) as server:
+        (client,) = clients(server, 1)
+        deadline = time.monotonic() + PATIENCE_S
+        late = math.inf
+        while late > 0.0 and time.monotonic() < deadline:  # the kernel begins to stamp in its own time
+            client.send(sync())
+            sent_s = time.time()
+            time.sleep(0.02)
+            late = server.recv(PATIENCE_S).timestamp - sent_s
+        assert late <= 0.0
+        for _ in range(4):  # one read, and one stamp: the others are between it and that of the last read
+            client.send(sync())
+            time.sleep(0.02)
+        steps = np.diff([server.recv(PATIENCE_S).timestamp for _ in range(4)])
+        assert np.all(steps > 0.0) and steps == pytest.approx([steps[0]] * 3, rel=1e-3)
+        client.shutdown()
 
 
 def test_one_thread_sends_while_another_one_serves(monkeypatch):

@@ -10,6 +10,8 @@ from __future__ import annotations
 import errno
 import selectors
 import socket
+import struct
+import sys
 import threading
 import time
 from collections import deque
@@ -29,16 +31,19 @@ _LARGEST_BACKLOG = 1 << 20  # unread bytes at which a client is dropped
 _LONGEST_COMMAND = 1 << 12
 _SETTLE_S = 0.05  # python-can's client takes its greeting for one whole read: no frame may follow at once
 _CHUNK = 1 << 16
+_SO_TIMESTAMPNS = 35  # socket(7): the kernel stamps what arrives; Linux
+_STAMP = struct.Struct("@qq")  # s, ns
 
 
 class _Client:
     """One connection: protocol state and unsent bytes."""
 
-    __slots__ = ("hold_until_s", "open", "pending", "raw", "received", "socket", "unsent")
+    __slots__ = ("hold_until_s", "open", "pending", "raw", "received", "socket", "stamp_s", "unsent")
 
     def __init__(self, connection: socket.socket) -> None:
         self.socket = connection
         self.received = ""
+        self.stamp_s = time.time()  # of what was received last
         self.unsent = bytearray()
         self.open = self.raw = False
         self.hold_until_s = 0.0
@@ -124,6 +129,8 @@ class SocketcandServer(can.BusABC):
         connection, _ = self._listener.accept()
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if sys.platform == "linux":
+            connection.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         client = _Client(connection)
         self._clients.append(client)
         self._selector.register(connection, selectors.EVENT_READ, client)
@@ -137,8 +144,9 @@ class SocketcandServer(can.BusABC):
                 client.socket.close()
 
     def _read(self, client: _Client) -> None:
+        ancillary: list[tuple[int, int, bytes]] = []
         try:
-            data = client.socket.recv(_CHUNK)
+            data, ancillary, _, _ = client.socket.recvmsg(_CHUNK, socket.CMSG_SPACE(_STAMP.size))
         except BlockingIOError:
             return
         except OSError:
@@ -151,12 +159,16 @@ class SocketcandServer(can.BusABC):
         if len(rest) > _LONGEST_COMMAND:
             self._drop(client)
             return
-        for command in commands:
-            self._obey(client, command.strip().removeprefix("<").split())
+        # The stamp is that of the last one; those before it came between that and the last read.
+        before_s, client.stamp_s = client.stamp_s, _stamp_s(ancillary)
+        step_s = (client.stamp_s - before_s) / max(len(commands), 1)
+        for number, command in enumerate(commands, 1):
+            stamp_s = before_s + number * step_s
+            self._obey(client, command.strip().removeprefix("<").split(), stamp_s)
 
-    def _obey(self, client: _Client, words: list[str]) -> None:
+    def _obey(self, client: _Client, words: list[str], stamp_s: float) -> None:
         if words[:1] == ["send"] and client.open:
-            self._forward(client, words[1:])
+            self._forward(client, words[1:], stamp_s)
         elif words[:1] == ["open"] and len(words) == 2:
             client.open = not self.channel or words[1] == self.channel
             self._write(client, b"< ok >" if client.open else b"< error could not open bus >")
@@ -169,9 +181,9 @@ class SocketcandServer(can.BusABC):
         else:
             self._write(client, b"< error unknown command >")
 
-    def _forward(self, client: _Client, words: list[str]) -> None:
+    def _forward(self, client: _Client, words: list[str], stamp_s: float) -> None:
         try:
-            message = _message(words)
+            message = _message(words, stamp_s)
         except ValueError:
             self._write(client, b"< error could not parse frame >")
             return
@@ -222,12 +234,21 @@ def _frame(message: can.Message, stamp_s: float) -> bytes:
     return f"< frame {message.arbitration_id:0{width}X} {stamp_s:.6f} {data} >".encode("ascii")
 
 
-def _message(words: list[str]) -> can.Message:
+def _stamp_s(ancillary: list[tuple[int, int, bytes]]) -> float:
+    """UNIX time at which the kernel received it: this process may run much later."""
+    for level, kind, data in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS) and len(data) == _STAMP.size:
+            seconds, nanoseconds = _STAMP.unpack(data)
+            return float(seconds + nanoseconds * 1e-9)
+    return time.time()
+
+
+def _message(words: list[str], stamp_s: float) -> can.Message:
     identifier, length, *data = words
     if len(data) != int(length) or len(data) > 8:
         raise ValueError("length")
     return can.Message(
-        timestamp=time.time(),
+        timestamp=stamp_s,
         arbitration_id=int(identifier, 16),
         is_extended_id=len(identifier) > 3,
         data=bytes(int(byte, 16) for byte in data),

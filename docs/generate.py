@@ -25,6 +25,7 @@ from pydantic_core import PydanticUndefined
 from drivelink import cli, jointfile
 from drivelink.jointfile import schema
 from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, SAMPLE, Field, Layout
+from drivelink.recording.formats import FORMATS
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.flexibility import TransmissionModel
@@ -32,6 +33,7 @@ from estimator.ranges import range_of
 from estimator.reasons import REASONS
 from estimator.sample import Bits, ExternalStatus, Status
 from estimator.transmissions import MODELS
+from sim.canopen.profiles import PROFILES
 from sim.effects import LISTED, UNLISTED, Definition
 
 ROOT = Path(__file__).parent.parent
@@ -289,6 +291,20 @@ def defaults_table(definitions: Iterable[Definition]) -> str:
     return "\n".join(rows)
 
 
+def formats_table() -> str:
+    """One row a format of recordings."""
+    rows = ["| ending | content | written | read |", "|---|---|---|---|"]
+    for ending, kind in FORMATS.items():
+        rows.append(f"| `{ending}` | {kind.holds} | {'yes' if kind.sink else 'no'} | yes |")
+    return "\n".join(rows)
+
+
+def profiles_table() -> str:
+    """One row a profile of a maker's drives."""
+    rows = ["| name | differences |", "|---|---|"]
+    return "\n".join([*rows, *(f"| `{one.name}` | {one.differs} |" for one in PROFILES.values())])
+
+
 def unlisted_effects_table(definitions: Iterable[Definition]) -> str:
     """One row an effect that only the simulated world has."""
     rows = ["| effect | of | what it is | parameters and defaults |", "|---|---|---|---|"]
@@ -342,6 +358,8 @@ PARTS: dict[str, Callable[[], str]] = {
     "sample": partial(layout_table, SAMPLE),
     "status bits": partial(bits_table, Status),
     "reasons": reasons_table,
+    "formats": formats_table,
+    "profiles": profiles_table,
     "external bits": partial(bits_table, ExternalStatus),
     "effects' defaults": partial(defaults_table, LISTED.values()),
     "unlisted effects": partial(unlisted_effects_table, UNLISTED.values()),

@@ -19,7 +19,6 @@ import pytest
 
 from drivelink import cli, jointfile
 from drivelink.jointfile.columns import UNITS
-from sim.canopen.profiles import PROFILES
 from sim.excitation import KINDS
 from sim.faults import Faults
 
@@ -124,7 +123,6 @@ def test_commands_that_a_page_shows_can_be_parsed(page):
 @pytest.mark.parametrize(
     ("name", "heading", "known"),
     [
-        ("simulated-drives.md", "Vendor profiles", set(PROFILES)),
         ("simulated-drives.md", "Faults", {name for name in vars(Faults) if name[0] != "_"}),
         ("recordings.md", "Units", {unit for units in UNITS.values() for unit in units}),
         ("simulation.md", "Excitation", set(KINDS)),

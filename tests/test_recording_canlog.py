@@ -7,7 +7,7 @@ import pytest
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
-from drivelink.recording.canlog import NO_STAMP, LoggedFrame, read_frames
+from drivelink.recording.canlog import CAN_FORMATS, NO_STAMP, LoggedFrame, read_frames
 from drivelink.recording.cycles import SyncNumbering, numbered_ahead, numbered_at_once
 from drivelink.recording.formats import open_sink
 
@@ -78,7 +78,7 @@ def recorded(path, frames, every, ended=True):
 
 
 @pytest.mark.parametrize(
-    ("suffix", "ended"), [(s, e) for s in (".log", ".blf", ".asc") for e in (True, False)]
+    ("suffix", "ended"), [(s, e) for s, kind in CAN_FORMATS.items() if kind.writer for e in (True, False)]
 )
 def test_what_is_recorded_is_read_back_also_without_its_end(suffix, ended, tmp_path):
     frames = many_frames()

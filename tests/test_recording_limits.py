@@ -20,9 +20,9 @@ from drivelink.canopen.eds import load_eds
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import ZenohSection, load
 from drivelink.recording import read
-from drivelink.recording.canlog import read_frames
+from drivelink.recording.canlog import CAN_FORMATS, read_frames
 from drivelink.recording.corrections import Gathered
-from drivelink.recording.formats import open_sink
+from drivelink.recording.formats import FORMATS, open_sink
 from drivelink.recording.mapping import joint_of, side_file
 from drivelink.recording.mcapfile import message_fields, read_messages
 from drivelink.recording.playback import open_playback
@@ -108,7 +108,7 @@ def test_of_many_columns_only_the_known_ones_are_held_and_too_many_are_one_line(
     assert said.endswith("c11, … (4000 in all)")
 
 
-@pytest.mark.parametrize("name", ["r.csv", "r.log", "r.asc"])
+@pytest.mark.parametrize("name", [f"r{ending}" for ending, kind in FORMATS.items() if kind.text])
 @pytest.mark.parametrize("begin", [b"", HEADER.encode()])
 def test_a_line_without_an_end_is_one_line(name, begin, tmp_path):
     path = tmp_path / name
@@ -168,7 +168,7 @@ def test_every_bit_of_an_mcap_length_may_be_wrong(whole, tmp_path):
                 pass
 
 
-@pytest.mark.parametrize("suffix", [".log", ".asc"])
+@pytest.mark.parametrize("suffix", [s for s, kind in CAN_FORMATS.items() if kind.writer and kind.text])
 def test_no_cut_of_a_log_makes_another_frame(suffix, tmp_path, caplog):
     path = tmp_path / f"r{suffix}"
     log_of(path, frames(12))
@@ -223,7 +223,7 @@ def test_messages_of_others_in_an_mcap_file_are_one_line(tmp_path):
 
 def test_a_reader_of_others_reads_our_logs(whole):
     """The mapping is kept beside a log, so that a log is what its format says, and nothing else."""
-    for suffix in (".log", ".blf", ".asc"):
+    for suffix in (s for s, kind in CAN_FORMATS.items() if kind.writer):
         with can.LogReader(whole / f"r{suffix}") as reader:
             assert sum(1 for _ in reader) == 300
 
@@ -249,7 +249,7 @@ def test_the_joint_file_in_a_recording_opens_nothing(name, tmp_path):
     assert fleet.carried_joint(path).file == carried.joint
 
 
-@pytest.mark.parametrize("suffix", [".mcap", ".csv", ".log", ".blf", ".asc", ".toml", ".eds", "the mapping"])
+@pytest.mark.parametrize("suffix", [*FORMATS, ".toml", ".eds", "the mapping"])
 def test_only_regular_files_are_opened(suffix, tmp_path):
     path = tmp_path / f"r{suffix}"
     work = {".toml": lambda: load(path), ".eds": lambda: load_eds(path)}.get(

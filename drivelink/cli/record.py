@@ -26,7 +26,7 @@ from drivelink.files import check_target
 from drivelink.jointfile import JointFile, JointText
 from drivelink.pubsub.feed import DECODERS
 from drivelink.pubsub.session import close_session, open_client
-from drivelink.recording.formats import open_sink
+from drivelink.recording.formats import FORMATS, open_sink
 from drivelink.recording.foxglove import write_layouts
 from drivelink.recording.mapping import layouts_from, mapping_document, side_file
 from drivelink.recording.recorder import BusTap, FirstSource, Recorder, ZenohTap
@@ -39,14 +39,11 @@ _PLURAL = {
     "frame": "frames",
 }  # fmt: skip
 
-EPILOG = """\
+EPILOG = f"""\
 The ending of FILE selects the format:
-  .mcap                     samples, estimates, status, model, joint file and raw CAN: replays everything,
-                            opens in Foxglove and PlotJuggler
-  .csv                      samples
-  .log .blf .asc            raw CAN, as candump and Vector's tools write it
-
-A raw CAN log gets FILE.mapping.json beside it: how the daemon has the frames mapped, and the joint file.
+{"".join(f"  {ending:8}{kind.holds}{chr(10)}" for ending, kind in FORMATS.items() if kind.sink)}
+An MCAP file replays everything, and opens in Foxglove and PlotJuggler. A raw CAN log gets FILE.mapping.json
+beside it: how the daemon has the frames mapped, and the joint file.
 
 Recording runs in this process and never holds up the daemon. A kill, a full disk or a power loss leaves a
 file that can be read up to the last second.

@@ -20,6 +20,7 @@ from drivelink.recording import read
 from drivelink.recording.canframes import is_frame_log
 from drivelink.recording.columns import parse_column_map
 from drivelink.recording.corrections import Gathered, gate
+from drivelink.recording.formats import FORMATS
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.outputs import EstimatesFile, Publication, Summary
 from drivelink.recording.playback import Playback, Played, open_playback
@@ -30,8 +31,8 @@ _INTERRUPTED = 130
 _METER_EVERY = 512
 _SUBSCRIBER_S = 1.5
 
-EPILOG = """\
-formats: .csv, .mcap, and raw CAN: candump .log in its variants, .blf, .asc
+EPILOG = f"""\
+formats: {", ".join(FORMATS)}
 
 examples:
   drivelink replay run.csv --joint elbow.toml --out estimates.csv --plots plots/

@@ -42,6 +42,7 @@ class _BlfWriter(can.BLFWriter):
 class CanFormat(NamedTuple):
     """A format of raw frames."""
 
+    tool: str  # that writes it
     writer: Any  # python-can's; None: not written
     reader: Any = None  # python-can's; None: text as candump writes it, read here
     bounded: Any = None  # what the reader reads from, see `limits`
@@ -49,10 +50,10 @@ class CanFormat(NamedTuple):
 
 
 CAN_FORMATS = {
-    ".log": CanFormat(can.CanutilsLogWriter),
-    ".candump": CanFormat(None),
-    ".blf": CanFormat(_BlfWriter, can.BLFReader, BlfBytes, text=False),
-    ".asc": CanFormat(can.ASCWriter, can.ASCReader, AscText),
+    ".log": CanFormat("candump", can.CanutilsLogWriter),
+    ".candump": CanFormat("candump", None),
+    ".blf": CanFormat("Vector", _BlfWriter, can.BLFReader, BlfBytes, text=False),
+    ".asc": CanFormat("Vector", can.ASCWriter, can.ASCReader, AscText),
 }
 """Formats of raw frames, by the ending of the file's name."""
 

@@ -208,6 +208,7 @@ Columns = tuple[dict[str, FloatArray], tuple[str, ...]]
 class Format(NamedTuple):
     """A format of recordings."""
 
+    holds: str  # in a few words
     sink: Callable[..., Sink] | None = None  # its writer; None: only read
     # reads columns by their names in the file, and names of those left out; None: it has none
     columns: Callable[[Path, ColumnMap], Columns] | None = None
@@ -216,9 +217,12 @@ class Format(NamedTuple):
 
 
 FORMATS = {
-    ".mcap": Format(McapSink),
-    ".csv": Format(CsvSink, read_csv_columns, text=True),
-} | {suffix: Format(CanSink if kind.writer else None, text=kind.text) for suffix, kind in CAN_FORMATS.items()}
+    ".mcap": Format("samples, estimates, status, model, joint file, mapping, raw CAN", McapSink),
+    ".csv": Format("samples", CsvSink, read_csv_columns, text=True),
+} | {
+    suffix: Format(f"raw CAN, {kind.tool}", CanSink if kind.writer else None, text=kind.text)
+    for suffix, kind in CAN_FORMATS.items()
+}
 
 
 CONVERTERS = {

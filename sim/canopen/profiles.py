@@ -16,6 +16,7 @@ class Quirks:
     """Deviations of one maker's drive from the strict one."""
 
     name: str = "strict"  # how the profile is called
+    differs: str = "default: none"  # how, in a few words
     # its shipped EDS file, without the ending: objects, access, power-on values, TPDOs
     eds: str = "cia402-drive"
     # 0x1008 and product code (0x1018:02), where they differ from the EDS file
@@ -47,22 +48,81 @@ PROFILES: dict[str, Quirks] = {
     quirks.name: quirks
     for quirks in (
         Quirks(),
-        Quirks(name="epos4", eds="epos4", current_ma=(0x30D1, 2)),
-        Quirks(name="elmo", eds="elmo", velocity_unit=_COUNTS_PER_S),
-        Quirks(name="nanotec", eds="nanotec", second_encoder=2),
-        Quirks(name="copley", eds="copley", velocity_unit=_TENTH_COUNTS_PER_S),
-        Quirks(name="roboteq", eds="roboteq", velocity_unit=_RPM, keep_bit_30=True, self_starting=True),
+        Quirks(
+            name="epos4",
+            differs=(
+                "no 0x6063, 0x6075, 0x6078, 0x607E, 0x608F, 0x6091, 0x1006, 0x1019, 0x1800:05; current in "
+                "mA at 0x30D1:02; 0x1005 constant; TPDO type 255 with 1 ms inhibit time; whole rpm"
+            ),
+            eds="epos4",
+            current_ma=(0x30D1, 2),
+        ),
+        Quirks(
+            name="elmo",
+            differs="velocity in counts/s without 0x60A9; TPDO1 and TPDO3 on with type 1",
+            eds="elmo",
+            velocity_unit=_COUNTS_PER_S,
+        ),
+        Quirks(
+            name="nanotec",
+            differs=(
+                "0x60E4:01 sensorless, link encoder 0x60E4:02; no 0x6076, 0x6078; eight TPDOs, the first "
+                "four event-driven"
+            ),
+            eds="nanotec",
+            second_encoder=2,
+        ),
+        Quirks(
+            name="copley",
+            differs="no second encoder, no polarity; velocity in 0.1 counts/s without 0x60A9",
+            eds="copley",
+            velocity_unit=_TENTH_COUNTS_PER_S,
+        ),
+        Quirks(
+            name="roboteq",
+            differs="aborts if bit 30 of a COB-ID changes; starts itself; few objects",
+            eds="roboteq",
+            velocity_unit=_RPM,
+            keep_bit_30=True,
+            self_starting=True,
+        ),
         Quirks(
             name="synapticon",
+            differs="mapping in pre-operational only; 0.001 to 1 rpm",
             eds="synapticon",
             mapping_in_preoperational=True,
             velocity_exponents=(0, -1, -2, -3),
         ),
-        Quirks(name="fixed-map", eds="fixed-map", fixed_mapping=True),
-        Quirks(name="el72x1", identity=_like("EL72x1", 0x7201), toggle_bit_10=True),
-        Quirks(name="self-starting", identity=_like("self-starting", 0x0F02), self_starting=True),
-        Quirks(name="keeps-pdos", identity=_like("PDO-keeping", 0x0F03), keeps_pdos=True),
-        Quirks(name="slow-boot", identity=_like("slow-boot", 0x0F04), boot_s=1.5),
+        Quirks(
+            name="fixed-map",
+            differs="mapping read only: TPDO2 carries statusword, position, torque",
+            eds="fixed-map",
+            fixed_mapping=True,
+        ),
+        Quirks(
+            name="el72x1",
+            differs="statusword bit 10 toggles",
+            identity=_like("EL72x1", 0x7201),
+            toggle_bit_10=True,
+        ),
+        Quirks(
+            name="self-starting",
+            differs="operational after boot-up",
+            identity=_like("self-starting", 0x0F02),
+            self_starting=True,
+        ),
+        Quirks(
+            name="keeps-pdos",
+            differs="*reset communication* keeps the PDOs",
+            identity=_like("PDO-keeping", 0x0F03),
+            keeps_pdos=True,
+        ),
+        Quirks(
+            name="slow-boot",
+            differs="1.5 s from reset to boot-up",
+            identity=_like("slow-boot", 0x0F04),
+            boot_s=1.5,
+        ),
     )
 }
 """By name, in the order shown to users."""

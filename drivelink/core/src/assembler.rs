@@ -18,7 +18,14 @@ use estimator_core::sample::{MOTORS, Sample};
 use crate::cross_check::CrossCheck;
 use crate::frames::TpdoDecoder;
 use crate::node::Node;
-use crate::status::{BUS_FAULT, DRIVE_FAULT, NODE_RESTARTED, UNTIMED};
+use status::{BUS_FAULT, DRIVE_FAULT, NODE_RESTARTED, UNTIMED};
+
+/// Bits of an estimate's status that the service adds.
+pub mod status {
+    estimator_core::status_bits! {
+        DRIVE_FAULT = 8, BUS_FAULT = 9, STALE = 10, UNTIMED = 11, NODE_RESTARTED = 12, CONTRADICTED = 14,
+    }
+}
 
 /// Identifier of SYNC.
 pub const SYNC_COB_ID: u32 = 0x080;

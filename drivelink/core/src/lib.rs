@@ -13,5 +13,4 @@ pub mod node;
 pub mod pipeline;
 #[cfg(feature = "python")]
 pub mod python;
-pub mod status;
 pub mod wire;

@@ -7,8 +7,8 @@ use estimator_core::external::External;
 use estimator_core::sample::status::{MODEL_ALARM, RESTARTED, USABLE, VALID};
 use estimator_core::sample::{Estimate, Sample};
 
+use crate::assembler::status::{CONTRADICTED, NODE_RESTARTED, STALE, UNTIMED};
 use crate::assembler::{Assembler, SYNC_COB_ID};
-use crate::status::{CONTRADICTED, NODE_RESTARTED, STALE, UNTIMED};
 use crate::wire::{Payload, encode_estimate, encode_external, encode_sample};
 
 /// Why an estimator could not step: never the compiled one, perhaps one that somebody registered.

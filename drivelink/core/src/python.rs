@@ -50,7 +50,7 @@ mod extension {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
-        let bits = estimator_core::sample::status::BITS.iter().chain(crate::status::BITS);
+        let bits = estimator_core::sample::status::BITS.iter().chain(crate::assembler::status::BITS);
         module.add("STATUS_BITS", bits.copied().collect::<HashMap<_, _>>())?;
         let messages = crate::wire::MESSAGES.map(|(name, fields)| (name, fields.to_vec()));
         module.add("MESSAGES", HashMap::from(messages))?;

@@ -2,11 +2,11 @@
 
 use estimator_core::sample::MOTORS;
 
+use super::status::CONTRADICTED;
 use super::{Assembler, COB_IDS, Receiver, SYNC_COB_ID, VALUES};
 use crate::frames::TpdoDecoder;
 use crate::layout;
 use crate::node::Node;
-use crate::status::CONTRADICTED;
 
 impl Assembler {
     /// The assembler of a joint with so many motors.

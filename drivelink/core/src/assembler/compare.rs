@@ -1,10 +1,10 @@
 //! Which readings of one quantity a joint's frames carry, and whether they contradict each other.
 
 use super::Assembler;
+use super::status::CONTRADICTED;
 use crate::cross_check::{CrossCheck, Kind, spoils};
 use crate::frames::target;
 use crate::layout::Signal;
-use crate::status::CONTRADICTED;
 
 impl Assembler {
     /// Which readings of one quantity are mapped.

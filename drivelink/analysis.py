@@ -14,7 +14,7 @@ from drivelink import jointfile, recording
 from drivelink.errors import HarmfulModelError, RecordingError, UsageError
 from drivelink.files import check_target
 from drivelink.jointfile import JointText, apply_diagnosis
-from drivelink.jointfile.apply_diagnosis import floor_entry
+from drivelink.jointfile.apply_diagnosis import as_read, diagnosed_model, floor_entry
 from drivelink.output import fitreport, plots, report, sentences
 from drivelink.output import motion as motions
 from drivelink.output.comparison import beside
@@ -30,8 +30,9 @@ from estimator.diagnosis.motion import NextMotion, design
 from estimator.diagnosis.shape import Limits
 from estimator.errors import EstimatorError
 from estimator.freerun import FreeRun, free_run
+from estimator.harm import Unseen, harm, harm_of_parts
 from estimator.identify import Identified, identify
-from estimator.model_monitor import harm
+from estimator.model import JointModel
 from estimator.sample import Record
 from estimator.transmissions import RIGID
 
@@ -134,7 +135,7 @@ class Fit:
 
         Raises:
             RecordingError: the motion does not determine a stiffness above zero.
-            HarmfulModelError: the declared model is better on held-out data.
+            HarmfulModelError: the declared model is better on held-out data, or no stiffness is known.
             DrivelinkError: the file exists, is an input, or cannot be written.
         """
         path, runs = Path(target), self.runs
@@ -161,16 +162,15 @@ class Fit:
         return path
 
     def _harm(self) -> str | None:
-        """Why a fit without the last quarter is worse there than the declared model; None: it is not."""
-        declared, halves = self.runs.source.joint.model(), []
-        for one in self.runs.records:
-            last = one.sequence >= one.sequence[len(one) * 3 // 4]
-            halves.append((one.rows(~last), one.rows(last)))
-        try:
-            model = identify([kept for kept, _ in halves], declared, self.bandwidth_rad_s).model
-        except EstimatorError:  # too short to hold a part out
-            return harm(declared, self.found.model, self.runs.records)
-        return harm(declared, model, [held for _, held in halves])
+        joint = self.runs.source.joint
+        declared = joint.model()
+
+        def make(records: Sequence[Record]) -> JointModel:
+            found = identify(records, declared, self.bandwidth_rad_s)
+            return as_read(found.model, records, found.surplus)
+
+        written = as_read(self.found.model, self.runs.records, self.found.surplus)
+        return harm_of_parts(declared, written, self.runs.records, make, joint.estimator)
 
     def _require_stiffness(self) -> None:
         named = ", ".join(map(str, self.runs.paths))
@@ -228,7 +228,7 @@ class Diagnosed:
         joint, out = self.runs.source.joint, Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         title = report.Title(joint.name, self.runs.named, self.validated, joint.axis == "linear")
-        written = apply_diagnosis.diagnosed_model(joint, self.outcome)
+        written = diagnosed_model(joint, self.outcome)
         record = self.runs.records[0] if self.held is None else self.held
         made = beside(self.runs.named, joint.model(), written, record, Units(title.linear))
         more = [*([] if self.motion is None else [motions.section(self.motion, Units(title.linear))]), *made]
@@ -282,17 +282,29 @@ class Diagnosed:
             force: replace it if it exists.
 
         Raises:
-            HarmfulModelError: the declared model is better on held-out data.
+            HarmfulModelError: the declared model is better on held-out data, or no stiffness is known.
             DrivelinkError: the file exists, is an input, or cannot be written.
         """
         path, runs = Path(target), self.runs
         check_target(path, runs.inputs, force=force)
-        joint = runs.source.joint
-        written = apply_diagnosis.diagnosed_model(joint, self.outcome)
-        if harmful := harm(joint.model(), written, runs.records if self.held is None else [self.held]):
+        if harmful := self._harm():
             raise HarmfulModelError(f"{runs.named}: --write: {harmful}: no joint file is written")
         apply_diagnosis.write(runs.source, path, self.outcome, runs.records[0], runs.named, force=force)
         return path
+
+    def _harm(self) -> str | None:
+        joint, records = self.runs.source.joint, self.runs.records
+
+        def as_written(outcome: Diagnosis, records: Sequence[Record]) -> JointModel:
+            return as_read(diagnosed_model(joint, outcome), records[0], outcome.surplus)
+
+        def make(kept: list[Record]) -> JointModel:
+            return as_written(_diagnose(kept, joint.model(), self.outcome.bandwidth_hz), kept)
+
+        written = as_written(self.outcome, records)
+        if self.held is not None:
+            return harm(joint.model(), written, [Unseen.whole(self.held)], joint.estimator)
+        return harm_of_parts(joint.model(), written, records, make, joint.estimator)
 
 
 def load(

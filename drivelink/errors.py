@@ -34,7 +34,7 @@ class RecordingError(DrivelinkError):
 
 
 class HarmfulModelError(RecordingError):
-    """A new model leaves more of the torque on held-out data than the declared one: it is not written."""
+    """A new model is worse on held-out data than the declared one, or undetermined: it is not written."""
 
 
 class BusError(DrivelinkError):

@@ -106,6 +106,9 @@ CHOICES: dict[str, Choice] = {
         0.05, "error", "that a written model may leave beyond the declared one's",
         "what is held out differs from the rest by more",
     ),
+    "unseen": Choice(
+        0.25, "recording", "held out to see what a written model does", "most of it is to make the model"
+    ),
     "one_sine": Choice(
         1.08, "spectral lines", "of a motion that separates nothing", "one, and what its window leaks"
     ),

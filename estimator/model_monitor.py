@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from estimator import _core
-from estimator.choices import choice
 from estimator.errors import EstimatorError
 from estimator.model import JointModel, require, require_finite
-from estimator.sample import Estimate, FloatArray, Record, Sample
+from estimator.sample import Estimate, Record, Sample
 from estimator.settings import EstimatorSettings
 
 __all__ = [
@@ -24,7 +23,7 @@ __all__ = [
     "ResidualBaseline",
     "Second",
     "can_monitor",
-    "harm",
+    "expecting",
     "measure_baseline",
     "seconds_of",
 ]
@@ -106,39 +105,6 @@ def seconds_of(record: Record, model: JointModel) -> list[Second]:
     return made
 
 
-def harm(declared: JointModel, written: JointModel, records: Sequence[Record]) -> str | None:
-    """Say in one sentence that a model leaves more of the motors' torques than the declared one; None: it
-    does not.
-
-    Compared is the logarithm of the error, second by second, less its standard error. A declared model
-    without parameters leaves all of the torque.
-
-    Args:
-        declared: the joint as declared.
-        written: as it is to be written.
-        records: data that took no part in fitting it.
-    """
-    if not can_monitor(written):
-        return None
-
-    def squares(model: JointModel, name: str) -> FloatArray:
-        seconds = [second for one in records for second in seconds_of(one, model)]
-        return np.array([np.sum(np.square(getattr(s, name)[: len(model.motors)])) for s in seconds])
-
-    after, torque = squares(written, "residual_nm"), squares(written, "torque_nm")
-    before = squares(declared, "residual_nm") if can_monitor(declared) else torque
-    if len(after) < _LEAST_SECONDS:
-        return None
-    least = choice("floor") ** 2 * float(np.mean(torque))
-    more = 0.5 * np.log((after + least) / (before + least))
-    scatter = float(np.std(more, ddof=1)) / math.sqrt(len(more))
-    if float(np.mean(more)) - scatter <= math.log1p(choice("harm")):
-        return None
-    rms = [math.sqrt(float(np.mean(x))) for x in (after, before)]
-    whose = "the declared one" if can_monitor(declared) else "no model"
-    return f"on held-out data the new model leaves {rms[0]:.3g} N·m of the torque, {whose} {rms[1]:.3g}"
-
-
 def measure_baseline(
     record: Record | Sequence[Record], model: JointModel, surplus: float = 1.0
 ) -> ResidualBaseline:
@@ -164,6 +130,16 @@ def measure_baseline(
         torque_nm=tuple(usual.tolist()),
         log_std=tuple(np.std(logarithm, axis=0, ddof=1).tolist()),
         seconds=len(residuals),
+    )
+
+
+def expecting(model: JointModel, baseline: ResidualBaseline | None) -> JointModel:
+    """Return a model whose motors know what its fit has left of their torques."""
+    if baseline is None or len(baseline.residual_nm) < len(model.motors):
+        return model
+    rms = zip(model.motors, baseline.residual_nm, baseline.torque_nm, strict=False)
+    return replace(
+        model, motors=tuple(replace(motor, fit_rms_nm=(left, torque)) for motor, left, torque in rms)
     )
 
 

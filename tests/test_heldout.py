@@ -14,9 +14,10 @@ from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.hypothesis import Problem
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
+from estimator.harm import Unseen, harm, harm_of_parts
 from estimator.identify import identify
 from estimator.model import JointModel, Transmission
-from estimator.model_monitor import harm, measure_baseline
+from estimator.model_monitor import measure_baseline
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import MODELS
 
@@ -155,7 +156,55 @@ def test_a_file_that_explains_less_than_the_declared_one_is_not_written(healthy)
         (soft, right, "None"), (right, right, "None"), (model, right, "None"),
         (right, soft, "N·m of the torque, the declared one"), (model, with_spring(3.0 * kit.STIFFNESS), "no model"),
     ):  # fmt: skip
-        assert said in str(harm(declared, written, [healthy]))
+        assert said in str(harm(declared, written, [Unseen.whole(healthy)]))
+
+
+def test_a_file_that_makes_the_estimator_worse_is_not_written(healthy):
+    """Its balance leaves less than no model, but the declared file is right on line."""
+    model = kit.model()
+
+    def surely(share: float) -> JointModel:
+        own = Transmission(
+            model="linear", parameters={"k_nm_rad": share * kit.STIFFNESS}, covariance=((1.0,),)
+        )
+        return replace(model, motors=(replace(model.motors[0], transmission=own),))
+
+    for written, said in (
+        (surely(1.0), "None"), (surely(0.95), "valid estimates leave"),
+        (model, "do not determine the stiffness of motor 1"),
+    ):  # fmt: skip
+        assert said in str(harm(model, written, [Unseen.whole(healthy)]))
+
+
+@pytest.mark.parametrize(("seen", "worse"), [(0.6, True), (0.93, False), (1.0, False)])
+def test_validity_that_falls_by_more_than_its_standard_error_is_harm(seen, worse, healthy, monkeypatch):
+    model = kit.model()
+    law = Transmission(model="linear", parameters={"k_nm_rad": kit.STIFFNESS})
+    written = replace(model, motors=(replace(model.motors[0], transmission=law),))
+
+    def replayed(of: JointModel, *_: object) -> FloatArray:
+        valid = np.full(10, seen if of is written else 0.95) + np.linspace(-0.05, 0.0, 10)
+        return np.column_stack((valid, np.full((10, 2), np.nan)))
+
+    monkeypatch.setattr("estimator.harm._replayed", replayed)
+    assert ("estimates are valid" in str(harm(model, written, [Unseen.whole(healthy)]))) is worse
+
+
+def test_a_file_is_not_written_while_its_balance_leaves_more_than_the_spring_carries(healthy):
+    model, law = kit.model(), Transmission(model="linear", parameters={"k_nm_rad": 1e-3 * kit.STIFFNESS})
+    weak = replace(model, motors=(replace(model.motors[0], transmission=law),))
+    assert "more than its spring carries" in str(harm(weak, weak, [Unseen.whole(healthy)]))
+
+
+def test_the_last_quarter_is_judged_by_a_model_made_of_the_others(healthy):
+    model, made = kit.model(), []
+
+    def make(records: list[Record]) -> JointModel:
+        made.append(len(records[0]))
+        return identify(records, model).model
+
+    assert harm_of_parts(model, identify(healthy, model).model, [healthy], make) is None
+    assert made == [len(healthy) * 3 // 4]
 
 
 @pytest.mark.parametrize(("variance", "determined"), [(4.0, True), (1e4, False), (-1.0, False)])

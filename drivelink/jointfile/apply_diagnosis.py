@@ -16,25 +16,42 @@ from estimator.diagnosis import Diagnosis
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.model import Effect, JointModel, Transmission
-from estimator.model_monitor import ModelMonitor, ResidualBaseline, can_monitor, measure_baseline
+from estimator.model_monitor import (
+    ModelMonitor,
+    ResidualBaseline,
+    can_monitor,
+    expecting,
+    measure_baseline,
+)
 from estimator.sample import Record
 
 _KEY = "floor"
 _LOG = logging.getLogger(__name__)
 
 
-def floor_entry(record: Record | Sequence[Record], model: JointModel, surplus: float) -> dict[str, Any]:
-    """Return the entry of [provenance] with the baseline (see `measure_baseline`); empty, with a
-    log line, if it cannot
-    be measured.
-    """
+def _baseline(
+    records: Record | Sequence[Record], model: JointModel, surplus: float
+) -> ResidualBaseline | None:
     if not can_monitor(model):
-        return {}
+        return None
     try:
-        return {_KEY: measure_baseline(record, model, surplus).as_dict()}
+        return measure_baseline(records, model, surplus)
     except EstimatorError as error:
         _LOG.warning("no residual baseline is written, so the daemon cannot raise the model alarm: %s", error)
-        return {}
+        return None
+
+
+def floor_entry(record: Record | Sequence[Record], model: JointModel, surplus: float) -> dict[str, Any]:
+    """Return the entry of [provenance] with the baseline (see `measure_baseline`); empty, with a
+    log line, if it cannot be measured.
+    """
+    baseline = _baseline(record, model, surplus)
+    return {} if baseline is None else {_KEY: baseline.as_dict()}
+
+
+def as_read(model: JointModel, record: Record | Sequence[Record], surplus: float) -> JointModel:
+    """Return a model as the file reads that is written of it: with the baseline of these recordings."""
+    return expecting(model, _baseline(record, model, surplus))
 
 
 def make_model_monitor(joint: JointFile) -> ModelMonitor | None:
@@ -102,7 +119,7 @@ def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
 def _all_effects(declared: tuple[Effect, ...], outcome: Diagnosis, motor: int | None) -> tuple[Effect, ...]:
     """Effects of one table: declared, corrections of the readings, found."""
     made = [*declared, *_readings(outcome, motor)]
-    for finding in outcome.effects:
+    for finding in outcome.effects if _decided(outcome) else ():
         kind = LIBRARY.get(finding.name)
         if kind is None:
             continue

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal, Self
 
 from annotated_types import Gt
@@ -20,7 +18,7 @@ from estimator.model import (
     Transmission,
     require_parameters,
 )
-from estimator.model_monitor import ResidualBaseline
+from estimator.model_monitor import ResidualBaseline, expecting
 from estimator.ranges import require_in_range
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import transmission_model
@@ -376,21 +374,12 @@ class JointFile(_Section):
 
     def model(self) -> JointModel:
         """Return the estimator's model of this joint."""
-        return JointModel(
+        entry = self.provenance.get("floor")
+        declared = JointModel(
             arrangement=self.arrangement,
-            motors=tuple(
-                replace(section.motor(), fit_rms_nm=rms)
-                for section, rms in zip(self.motor, self._fits(), strict=True)
-            ),
+            motors=tuple(section.motor() for section in self.motor),
             link=self.link.dynamics,
             link_effects=self.link.effect,
             period_s=self.bus.period_s if "period_s" in self.bus.model_fields_set else None,
         )
-
-    def _fits(self) -> Sequence[tuple[float, float] | None]:
-        """Return what this file's fit has left of each motor's torque, and that torque, rms, N·m."""
-        entry = self.provenance.get("floor")
-        baseline = ResidualBaseline.from_dict(entry) if isinstance(entry, dict) else None
-        if baseline is None or len(baseline.residual_nm) < len(self.motor):
-            return [None] * len(self.motor)
-        return list(zip(baseline.residual_nm, baseline.torque_nm, strict=True))[: len(self.motor)]
+        return expecting(declared, ResidualBaseline.from_dict(entry) if isinstance(entry, dict) else None)

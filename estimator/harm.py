@@ -1,0 +1,203 @@
+"""Whether a model that is to be written does harm: it and the declared one over data that it was not made of.
+
+Compared are the balance of the model as it stands, and what the estimator does with it from tick to tick: how
+often it is valid, what it then leaves of the torque, and the external torque against a sensor. Worse is what
+is worse by more than its standard error over the blocks and `harm`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from estimator.choices import choice, whole
+from estimator.errors import EstimatorError
+from estimator.model import JointModel
+from estimator.model_monitor import can_monitor, seconds_of
+from estimator.online import make_estimator
+from estimator.sample import ExternalStatus, FloatArray, Record, Status
+from estimator.settings import EstimatorSettings
+from estimator.transmissions import transmission_model
+
+__all__ = ["Unseen", "harm", "harm_of_parts"]
+
+
+class Unseen(NamedTuple):
+    """A recording, and the sequence number from which on it took no part in making a model."""
+
+    record: Record
+    since: int
+
+    @classmethod
+    def whole(cls, record: Record) -> Unseen:
+        """Return a recording of which no part did."""
+        return cls(record, int(record.sequence[0]))
+
+
+class _Figure(NamedTuple):
+    """A mean square or a share in each block, of the declared model and of the written one; NaN: none."""
+
+    declared: FloatArray
+    written: FloatArray
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """Of the blocks that have both: written, declared."""
+        both = np.isfinite(self.declared + self.written)
+        return math.sqrt(np.mean(self.written[both])), math.sqrt(np.mean(self.declared[both]))
+
+    def rises(self, least: float) -> bool:
+        """Return whether the root of it rises; differences below the root of `least` are none."""
+        return _above(0.5 * np.log((self.written + least) / (self.declared + least)), math.log1p)
+
+    def falls(self) -> bool:
+        """Return whether a share falls."""
+        return _above(self.declared - self.written, float)
+
+
+def _above(more: FloatArray, allowed: Callable[[float], float]) -> bool:
+    """Whether the mean of the blocks exceeds its standard error by more than is allowed."""
+    more = more[np.isfinite(more)]
+    if len(more) < 2:  # no standard error
+        return False
+    scatter = float(np.std(more, ddof=1)) / math.sqrt(len(more))
+    return float(np.mean(more)) - scatter > allowed(choice("harm"))
+
+
+def harm(
+    declared: JointModel,
+    written: JointModel,
+    unseen: Sequence[Unseen],
+    settings: EstimatorSettings | None = None,
+) -> str | None:
+    """Say in one clause what a model makes worse than the declared one; None: nothing.
+
+    Args:
+        declared: the joint as declared.
+        written: as it is to be written.
+        unseen: data that took no part in making it.
+        settings: of the on-line estimator; left out: the defaults.
+    """
+    for number, motor in enumerate(written.motors, start=1):
+        if motor.flexible and not motor.transmission.parameters:
+            return f"these data do not determine the stiffness of motor {number}, and none is declared"
+    return (
+        _unexplained(written, unseen)
+        or _balance(declared, written, unseen)
+        or _on_line(declared, written, unseen, settings or EstimatorSettings())
+    )
+
+
+def harm_of_parts(
+    declared: JointModel,
+    written: JointModel,
+    records: Sequence[Record],
+    make: Callable[[list[Record]], JointModel],
+    settings: EstimatorSettings | None = None,
+) -> str | None:
+    """Say what a model makes worse in the last quarter of each recording, where it is made of the others.
+
+    Args:
+        declared: the joint as declared.
+        written: made of all data; it is compared on them where a part determines no stiffness.
+        records: all data.
+        make: makes the model of some.
+        settings: see `harm`.
+    """
+    if not can_monitor(written):
+        return harm(declared, written, [], settings)
+    unseen = [Unseen(one, int(one.sequence[int((1.0 - choice("unseen")) * len(one))])) for one in records]
+    try:
+        part = make([one.record.rows(one.record.sequence < one.since) for one in unseen])
+    except EstimatorError:  # too short to hold a part out
+        part = None
+    if part is None or not can_monitor(part):
+        return harm(declared, written, [Unseen.whole(one) for one in records], settings)
+    return harm(declared, part, unseen, settings)
+
+
+def _unexplained(written: JointModel, unseen: Sequence[Unseen]) -> str | None:
+    """What says that a motor's balance leaves more torque than its spring carries."""
+    seconds = [second for one in unseen for second in seconds_of(one.record, written)]
+    for i, motor in enumerate(written.motors):
+        law = transmission_model(motor.transmission)
+        if law is None or not motor.flexible or not seconds:
+            continue
+        alpha, carried = law.alpha(motor.transmission.parameters), []
+        for record, _ in unseen:
+            assert record.link_position_rad is not None
+            phi = record.link_position_rad - record.motor_position_rad[:, i]
+            carried.append(np.var(law.torque(phi, alpha)))
+        spring = math.sqrt(float(np.mean(carried)))
+        left = math.sqrt(float(np.mean([s.residual_nm[i] ** 2 for s in seconds])))
+        if left > spring:
+            which = f" of motor {i + 1}" if len(written.motors) > 1 else ""
+            return (
+                f"the balance{which} leaves {left:.3g} N·m, more than its spring carries ({spring:.3g} N·m)"
+            )
+    return None
+
+
+def _balance(declared: JointModel, written: JointModel, unseen: Sequence[Unseen]) -> str | None:
+    """What says that the model as it stands leaves more torque than the declared one, or than there is."""
+
+    def squares(model: JointModel, name: str) -> FloatArray:
+        seconds = [s for one in unseen for s in seconds_of(one.record, model) if _later(one, s.sequence)]
+        return np.array([np.sum(np.square(getattr(s, name)[: len(model.motors)])) for s in seconds])
+
+    known, torque = can_monitor(declared), squares(written, "torque_nm")
+    before = squares(declared, "residual_nm") if known else torque
+    figure = _Figure(before, squares(written, "residual_nm"))
+    if not len(torque) or not figure.rises(choice("floor") ** 2 * float(np.mean(torque))):
+        return None
+    after, rms = figure.rms
+    whose = "the declared one" if known else "no model"
+    return f"on held-out data the new model leaves {after:.3g} N·m of the torque, {whose} {rms:.3g}"
+
+
+def _later(one: Unseen, sequence: int) -> bool:
+    """Whether the second that ends with a sample is unseen."""
+    return one.since == one.record.sequence[0] or (sequence - one.since) * one.record.period_s >= 1.0
+
+
+def _on_line(
+    declared: JointModel, written: JointModel, unseen: Sequence[Unseen], settings: EstimatorSettings
+) -> str | None:
+    """What says that the estimator is valid less often, or leaves more torque where it is."""
+    sides = [
+        np.concatenate([_replayed(model, one, settings) for one in unseen]).T for model in (declared, written)
+    ]
+    valid, residual, external = (_Figure(*both) for both in zip(*sides, strict=True))
+    replayed = "replayed over held-out data"
+    if valid.falls():
+        new, old = (f"{float(np.mean(x)):.0%}" for x in (valid.written, valid.declared))
+        return f"{replayed} {new} of the new model's estimates are valid, {old} of the declared one's"
+    torque = float(np.mean([np.var(one.record.motor_torque_nm) for one in unseen]))
+    for figure, what in ((residual, "valid estimates leave"), (external, "its external torque errs by")):
+        if figure.rises(choice("floor") ** 2 * torque):
+            new, old = (f"{rms:.3g} N·m" for rms in figure.rms)
+            return f"{replayed} {what} {new} with the new model, {old} with the declared one"
+    return None
+
+
+def _replayed(model: JointModel, one: Unseen, settings: EstimatorSettings) -> FloatArray:
+    """(blocks, 3) share that is valid; mean squares of what that leaves, of the external torque's error."""
+    estimator = make_estimator(model, settings, one.record.period_s)
+    rows = []
+    for sample in one.record.samples():
+        good = bool(estimator.step(sample).status & Status.VALID)
+        left = estimator.residual_nm if good else math.nan
+        pushed, error = estimator.external, math.nan
+        if pushed is not None and pushed.status & ExternalStatus.VALID:
+            error = pushed.external_torque_nm - sample.external_torque_nm
+        rows.append((float(good), left**2, error**2))
+    seen = np.array(rows)[one.record.sequence >= one.since]
+    return np.array([[_mean(x) for x in part.T] for part in np.array_split(seen, whole("groups"))])
+
+
+def _mean(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.mean(known)) if len(known) else math.nan

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import diagnosiskit as kit
+import joints
 import numpy as np
 import pytest
 
@@ -101,6 +102,15 @@ def test_a_one_way_motion_has_no_free_curve_over_time(speed):
     bases = _bases(problem.frames[0], problem.null(), "motor", 0)
     over_time = [names for names, _ in bases if names == ("velocity", "time")]
     assert bool(over_time) is (speed == 0.0)
+
+
+def test_a_free_curve_has_the_same_terms_in_a_longer_recording():
+    record = kit.World([{}], seed=31, seconds=16.0).run()[0]
+    short, long = (Problem([one], kit.model(), 15.0) for one in (joints.part(record, slice(6000)), record))
+    for place in ("motor", "transmission", "link"):
+        for names, basis in _bases(short.frames[0], short.null(), place, 0):
+            columns = {basis(one.frames[0].motors[0]).shape[1] for one in (short, long)}
+            assert len(columns) == 1, names
 
 
 def test_of_the_motors_dry_friction_there_is_one_law():

@@ -105,7 +105,9 @@ def _bases(frame: Frame, beside: Fitted, location: str, motor: int) -> list[tupl
     if location == "transmission":
         if reversing:
             made.append((("deflection", "time"), _scaled("deflection", "time", slow, c)))
-        made.append((("deflection", "deflection_rate"), _creeping(1.0 / frame.signals.bandwidth_hz)))
+        longest_s = float(c.time[-1]) / whole("groups")
+        lags = _creeping(1.0 / frame.signals.bandwidth_hz, longest_s)
+        made.append((("deflection", "deflection_rate"), lags))
         path = _Splines(c.link_position, whole("groups"))
         made.append((("deflection", "link_position"), _scaled("deflection", "link_position", path, c, True)))
     made.append((("time",), _waves(frame, beside, *_line(frame, beside, location, motor))))
@@ -148,13 +150,13 @@ def _scaled(factor: str, over: str, splines: _Splines, c: Coordinates, alone: bo
     return basis
 
 
-def _creeping(shortest_s: float) -> Basis:
+def _creeping(shortest_s: float, longest_s: float) -> Basis:
     """Terms that follow the deflection with a lag: creep and relaxation, time constants an octave apart."""
+    lags_s = shortest_s * 2.0 ** np.arange(max(math.log2(longest_s / shortest_s), 0.0) + 1.0)
 
     def basis(c: Coordinates) -> FloatArray:
-        period, longest = float(c.time[1] - c.time[0]), float(c.time[-1]) / whole("groups")
-        made = []
-        for lag in shortest_s * 2.0 ** np.arange(max(math.log2(longest / shortest_s), 0.0) + 1.0):
+        period, made = float(c.time[1] - c.time[0]), []
+        for lag in lags_s:
             keep = math.exp(-period / lag)
             start = np.array([keep * c.deflection[0]])
             made.append(lfilter([1.0 - keep], [1.0, -keep], c.deflection, zi=start)[0])

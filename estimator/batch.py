@@ -369,6 +369,8 @@ def _transmission_fit(
     phi = np.concatenate([f.motors[i].deflection for f in frames])
     excited = law is not None and middle(law, alpha, covariance, phi).determined
     excited = excited and not any(fitted.posterior.bound[mine])
+    error_rms_nm = float(np.sqrt(np.mean(left[rows] ** 2)))
+    excited = excited and error_rms_nm <= float(np.std(torque))  # else it is of what is not explained
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     errors = {
         name: joint.mean(error, None if error == "encoder_delay" else i) for name, error in _NUISANCES.items()
@@ -384,7 +386,7 @@ def _transmission_fit(
         velocity_rad_s=_rows_of(frames, i, "velocity"),
         torque_nm=torque + left[rows],
         unexplained_nm=(left + _friction(joint, i))[rows],
-        error_rms_nm=float(np.sqrt(np.mean(left[rows] ** 2))),
+        error_rms_nm=error_rms_nm,
         torque_rms_nm=float(np.std(torque if excited else problem.torque()[rows])),
         inertia_kg_m2=motor.inertia_kg_m2 + errors["inertia"][0],
         viscous_damping_nm_s_rad=max(motor.viscous_damping_nm_s_rad + errors["damping"][0], 0.0),

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from drivelink.output.sentences import sentence
+from estimator import fit
 from estimator.diagnosis import Diagnosis, Errors, Finding, diagnose
 from estimator.diagnosis.curves import _bases
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Problem
+from estimator.diagnosis.judge import Judge, _Judged
 from estimator.diagnosis.search import Search
 from estimator.identify import identify
 from estimator.sample import Record
@@ -57,6 +59,48 @@ def test_a_free_curve_that_raises_the_error_is_not_said_to_explain_it():
     assert sentence(worse).endswith(
         "what was tried over position and torque does not lower the torque balance's error on held-out data, 82.00%."
     )
+
+
+@pytest.mark.parametrize(
+    ("verdict", "after", "said", "kept"),
+    [
+        ("effect", 0.3, "effect", "after"),
+        ("effect", 0.9, "insufficient_excitation", "before"),  # the declared one leaves less
+        ("effect", 1.2, "insufficient_excitation", "before"),
+        ("unexplained", 0.9, "unexplained", "before"),
+        ("sufficient", 0.9, "sufficient", "before"),
+    ],
+)
+def test_a_model_that_is_worse_on_held_out_data_is_not_shown(verdict, after, said, kept, monkeypatch):
+    left = {"before": 0.5, "after": after}
+    judge: Any = Judge.__new__(Judge)
+    judge.held = SimpleNamespace(
+        squared=lambda one: left[one] ** 2,
+        errors=lambda one, other: Errors(left[one], left[other], left[one], left[other]),
+    )
+    judged = _Judged(verdict, [finding("cogging", 1.0)], "before", "after", [])  # type: ignore[arg-type]
+    monkeypatch.setattr(Judge, "_explained", lambda *_: judged)
+    made = judge._judged([], None)
+    assert (made.verdict, made.after) == (said, kept)
+
+
+@pytest.mark.parametrize(("held", "verdict"), [(0.1, "sufficient"), (1.2, "insufficient_excitation")])
+def test_a_model_that_leaves_the_torque_of_other_data_is_not_sufficient(held, verdict, monkeypatch):
+    judge: Any = Judge.__new__(Judge)
+    judge.problem, judge.found = SimpleNamespace(frames=[None]), None
+    judge.held = SimpleNamespace(errors=lambda *_: Errors(held, held, held, held))
+    monkeypatch.setattr(Judge, "_left", lambda *_: 0.1)
+    monkeypatch.setattr("estimator.diagnosis.judge.poor", lambda _: False)
+    assert judge._named([])[0] == verdict
+
+
+def test_no_stiffness_is_fitted_where_the_balance_leaves_more_than_the_spring_carries(monkeypatch):
+    (record,) = kit.World([{}], seed=31, seconds=8.0).run()
+    monkeypatch.setattr("estimator.batch.middle", lambda *_: SimpleNamespace(determined=True))
+    shaken = 20.0 * np.sin(2.0 * np.pi * 1.7 * record.time_s) + record.motor_torque_nm[:, 0]
+    (one,) = fit(replace(record, motor_torque_nm=shaken[:, None]), kit.model(linked=False))
+    assert one.error_rms_nm > 5.0 and not one.parameters
+    assert fit(record, kit.model(linked=False))[0].parameters
 
 
 def test_a_second_healthy_recording_has_no_finding():

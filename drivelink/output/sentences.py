@@ -17,9 +17,8 @@ def free_curve(outcome: Diagnosis) -> Curve | None:
 def sentence(outcome: Diagnosis) -> str:
     """Return the verdict in one sentence."""
     error, held = "the torque balance's error on held-out data", outcome.validation
-    lower = held.after_rms_nm <= held.before_rms_nm
-    moves = "falls" if lower else "rises"
-    fall = f"{error} {moves} from {held.before_relative:.2%} to {held.after_relative:.2%}"
+    lower = held.after_rms_nm < held.before_rms_nm
+    fall = f"{error} falls from {held.before_relative:.2%} to {held.after_relative:.2%}"
     if outcome.verdict == "effect":
         return f"{lacks(outcome)}: {fall}."
     names = " and ".join(title_of(finding, outcome) for finding in outcome.effects)

@@ -75,6 +75,16 @@ class Judge:
         return self._stated(self._judged(effects, curve), beside)
 
     def _judged(self, effects: list[Finding], curve: Fitted | None) -> _Judged:
+        """The verdict, with the declared model kept where what explains it is worse on held-out data."""
+        judged = self._explained(effects, curve)
+        if not self._harmful(judged.before, judged.after):
+            return judged
+        if judged.verdict != "effect":
+            return judged._replace(after=judged.before)
+        notes = [*judged.notes, "on held-out data the effects do not lower the error: they are not written"]
+        return judged._replace(verdict="insufficient_excitation", after=judged.before, notes=notes)
+
+    def _explained(self, effects: list[Finding], curve: Fitted | None) -> _Judged:
         """The verdict on the effects found, or on a free curve that explains more than they do."""
         before = self._declared(effects)
         if curve is None or not self._unlisted(curve):
@@ -90,13 +100,7 @@ class Judge:
         if stamps:
             return _Judged("unexplained", [_unlisted(f) for f in effects], before, self.found, stamps, True)
         verdict, notes = self._named(effects)
-        after = self.found
-        if self._harmful(before, after):
-            after = before
-            if effects:
-                verdict = "insufficient_excitation"
-                notes.append("on held-out data the effects do not lower the error: they are not written")
-        return _Judged(verdict, effects, before, after, notes)
+        return _Judged(verdict, effects, before, self.found, notes)
 
     def _harmful(self, before: Fitted, after: Fitted) -> bool:
         """Whether a model is worse on held-out data than the declared one, or than none at all."""
@@ -119,7 +123,8 @@ class Judge:
             if not self.problem.frames[0].linked or not effects or any(f.alternatives for f in effects):
                 verdict = "insufficient_excitation"
             return verdict, ["the motion is hardly more than one sine: many effects look alike in it"]
-        left = self._left(self.found)
+        held = self.held.errors(self.found, self.found).after_relative
+        left = max(self._left(self.found), held)
         if verdict == "sufficient" and left > PRIORS["effect"].std:
             hidden = f"the model leaves {left:.0%} of the torque, and the recording hides what is missing"
             return "insufficient_excitation", [hidden]

@@ -80,7 +80,7 @@ def test_columns_of_others_are_read_in_our_names_and_units_also_in_place_of_ours
 
 
 def test_a_format_with_columns_is_one_entry(tmp_path, monkeypatch):
-    entry = Format(columns=lambda path, _: (dict(np.load(path)), ()))
+    entry = Format("arrays", columns=lambda path, _: (dict(np.load(path)), ()))
     monkeypatch.setitem(FORMATS, ".npz", entry)
     record, path = read(ours(tmp_path / "r.csv"), JOINT), tmp_path / "r.npz"
     motor, link = record.motor_position_rad[:, 0], record.link_position_rad

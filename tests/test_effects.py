@@ -13,18 +13,6 @@ from estimator.errors import EstimatorError
 from estimator.model import Effect, JointModel, Motor, Transmission
 from estimator.sample import Sample
 
-NAMES = {
-    "motor": (
-        "coulomb_friction stribeck_friction asymmetric_friction presliding_friction load_dependent_friction "
-        "viscous_damping quadratic_damping cogging torque_offset torque_constant torque_saturation "
-        "torque_drift motor_inertia torque_delay torque_lag back_driving_loss"
-    ),
-    "transmission": (
-        "hysteresis backlash asymmetric_stiffness higher_order_stiffness transmission_damping kinematic_error"
-    ),
-    "measurement": "deflection_offset encoder_eccentricity encoder_delay deflection_delay encoder_scale",
-    "link": "gravity link_coulomb_friction link_viscous_damping link_inertia contact",
-}
 VALUES = {"power": 5.0, "exponent": 2.0, "shape": 0.5, "side": -1.0, "periods_per_rev": 7.0}
 
 
@@ -41,12 +29,6 @@ def _joint(*effects: Effect) -> JointModel:
         motors=(Motor(inertia_kg_m2=0.1, transmission=transmission, effects=motor),),
         link_effects=link,
     )
-
-
-def test_every_name_of_the_contract_is_there_at_its_location():
-    assert {name: kind.location for name, kind in LIBRARY.items()} == {
-        name: location for location, names in NAMES.items() for name in names.split()
-    }
 
 
 NOWHERE = Coordinates(*(0.0 for _ in Coordinates._fields))

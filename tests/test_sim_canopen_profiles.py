@@ -158,5 +158,5 @@ def test_a_slow_device_boots_in_its_own_time():
 
 
 def test_an_unknown_profile_is_one_line_with_the_known_ones():
-    with pytest.raises(SimError, match=r"expected one of strict, epos4, .*got \"acme\""):
+    with pytest.raises(SimError, match=rf"expected one of {', '.join(PROFILES)}, got \"acme\""):
         profile("acme")

@@ -1,4 +1,4 @@
-"""Speed of the estimators: one tick, batch fits, a diagnosis, memory over many ticks.
+"""Speed of the estimators: one tick, batch fits, a diagnosis.
 
     python benchmarks/estimator_tick.py [--ticks N]
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import gc
 import time
-import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -118,21 +117,6 @@ def diagnosis(seconds: float) -> float:
     return time.thread_time() - begin
 
 
-def memory(n: int) -> float:
-    """Growth in bytes over n ticks of the robust mode, after a warm-up."""
-    estimator = make_estimator(joint("polynomial", 2), EstimatorSettings(), T)
-    samples = list(record(30_000, 2).samples())
-    tracemalloc.start()
-    start = 0
-    for k in range(len(samples) + n):
-        if k == len(samples):  # after the interpreter's own lists of free objects are full
-            start = tracemalloc.get_traced_memory()[0]
-        estimator.step(samples[k % len(samples)]._replace(sequence=k))
-    growth = tracemalloc.get_traced_memory()[0] - start
-    tracemalloc.stop()
-    return float(growth)
-
-
 def rows(args) -> Iterator[scene.Row]:
     """One row a case; ticks in µs, the rest in its unit."""
     for case, (name, settings) in _CASES.items():
@@ -143,7 +127,6 @@ def rows(args) -> Iterator[scene.Row]:
         yield {"case": f"fit of 1e5 samples, {name} / s", "p50": batch(name), **other}
     for seconds in (10.0, 30.0):
         yield {"case": f"diagnose {seconds:g} s at 1 kHz / s of CPU", "p50": diagnosis(seconds), **other}
-    yield {"case": "memory growth over 1e5 ticks / bytes", "p50": memory(100_000), **other}
 
 
 if __name__ == "__main__":

@@ -62,7 +62,6 @@ SECTIONS = {
     "loop": Section(
         "The loop that closes itself, on each effect", quick="--effects coulomb_friction,backlash"
     ),
-    "gate": Section("Wrong units, signs, gears and time", "--seeds 2", "--kinds serial"),
     "real_data": Section("Real data before and after"),
     "constants": Section("Choice constants halved and doubled", "--report"),
     "external": Section("External torque and contact", quick="--minutes 2 --errors 2 --joints sea"),

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
-    "ROOT", "Columns", "Option", "Row", "diagnosiskit", "faultmatrix", "fleetkit", "gatekit", "joints",
+    "ROOT", "Columns", "Option", "Row", "diagnosiskit", "faultmatrix", "fleetkit", "joints",
     "main", "table",
 ]  # fmt: skip
 
@@ -27,7 +27,6 @@ sys.path.append(str(ROOT / "tests"))  # the simulators and stages that the tests
 import diagnosiskit  # noqa: E402
 import faultmatrix  # noqa: E402
 import fleetkit  # noqa: E402
-import gatekit  # noqa: E402
 import joints  # noqa: E402
 
 

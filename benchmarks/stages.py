@@ -156,20 +156,6 @@ def paced(parts: list[Clocked] | list[Bare], recorded: Cycles) -> dict[str, Any]
     }
 
 
-def flat_out(parts: list[Clocked], recorded: Cycles) -> float:
-    """Cycles a second with nothing waited for."""
-    cpu_s = 0.0
-    for messages in recorded:
-        for part in parts:
-            for message in messages:
-                part.bus.queue.put(message)
-        start = time.thread_time()
-        for part in parts:
-            part.work([0] * len(STAGES))
-        cpu_s += time.thread_time() - start
-    return len(recorded) / cpu_s
-
-
 def measure(cycles: int, most: int) -> Iterator[scene.Row]:
     """One row a number of joints, up to `most`."""
     recordings = {
@@ -182,7 +168,6 @@ def measure(cycles: int, most: int) -> Iterator[scene.Row]:
         recorded, layouts = recordings[motors]
         parts = [Clocked(index, motors, layouts, session) for index in range(joints)]
         row = {"joints": joints, "motors": joints * motors, **paced(parts, recorded)}
-        row["flat_out_hz"] = flat_out(parts, recorded)
         bare = [Bare(index, motors, layouts, session) for index in range(joints)]
         row["floor"] = paced(bare, recorded)
         row["of_floor"] = row["process_us_per_cycle"] / row["floor"]["process_us_per_cycle"]
@@ -215,7 +200,6 @@ COLUMNS = {
     "process a cycle": "{process_us_per_cycle:.0f}",
     "of floor": "{of_floor:.1f}×",
     "over 1 ms": "{over_a_period} of {cycles}",
-    "flat out": "{flat_out_hz:.0f} Hz",
 }
 
 if __name__ == "__main__":

@@ -2,8 +2,6 @@
 
 import errno
 import os
-import resource
-import signal
 import stat
 import subprocess
 import sys
@@ -20,7 +18,6 @@ from drivelink.errors import RecordingError, UsageError
 from drivelink.files import NewFile, check_target, write_whole
 from drivelink.jointfile import parse
 from drivelink.recording.formats import open_sink
-from drivelink.recording.sinks import SafeFile
 from estimator.sample import Sample
 
 JOINT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.5\n[motor.transmission]\nmodel = "linear"\n'
@@ -158,24 +155,6 @@ def test_a_recording_takes_the_place_of_another_one_with_its_first_block(folder)
         sink.flush()
         assert path.read_text().startswith("time_s,") and path.read_text().count("\n") == 2 + k
     sink.close()
-
-
-def test_a_full_disk_cuts_a_recording_at_a_whole_block(folder):
-    file = SafeFile(folder / "r.bin")
-    file.write(b"a" * 1000)
-    file.sync()
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1500, hard))
-        file.write(b"b" * 1000)
-        with pytest.raises(RecordingError, match="it holds everything up to the last second"):
-            file.sync()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        signal.signal(signal.SIGXFSZ, before)
-    file.close()
-    assert (folder / "r.bin").read_bytes() == b"a" * 1000
 
 
 # The commands

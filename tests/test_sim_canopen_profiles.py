@@ -39,17 +39,6 @@ def map_tpdo2(wire, *, flags=0x40000000):
     ]
 
 
-@pytest.mark.parametrize("name", [name for name, quirks in PROFILES.items() if not quirks.fixed_mapping])
-def test_the_standard_order_maps_every_profile_and_sync_brings_the_frame(name):
-    with powered(name) as wire:
-        wire.wait(2.0)  # for the slow one
-        wire.say("000 80 00")  # for the self-starting ones
-        assert map_tpdo2(wire) == [0] * 8
-        wire.say("000 01 00")
-        frames = wire.say("080")
-        assert frames[0].startswith("281 ") or frames[1].startswith("281 ")
-
-
 PRE, START, SYNC, RANGE, STATE = "000 80 00", "000 01 00", "080", 0x06090030, 0x08000022
 # What each does beside the standard: a frame that is said, an object that is read and its value or abort code (< 0),
 # an object that is written with its size, and the abort code or 0.

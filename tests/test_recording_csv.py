@@ -1,6 +1,8 @@
 """CSV recordings: what is understood, what is mended and said, and what is one clear line."""
 
 import logging
+import shutil
+import subprocess
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -138,6 +140,27 @@ def test_irregular_stamps_that_the_motion_follows_are_resampled(spread, tmp_path
     # A held torque is late by half a step; its impulse is kept.
     impulse = record.period_s * np.sum(record.motor_torque_nm[:, 0])
     assert impulse == pytest.approx(np.sum(table[:-1, 2] * np.diff(time)), abs=2e-3)
+
+
+@pytest.mark.skipif(shutil.which("awk") is None, reason="no awk")
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        lambda t: np.sort(np.random.default_rng(3).uniform(0.0, t[-1], len(t))),
+        lambda t: np.repeat(t[9::10], 10),
+    ],
+    ids=["random", "in batches"],
+)
+def test_stamps_that_say_nothing_are_refused_with_the_command_that_numbers_the_rows(stamps, tmp_path):
+    table, path = rows(2000), tmp_path / "my run.csv"
+    table[:, 0] = stamps(table[:, 0])
+    with pytest.raises(RecordingError, match="the motion does not follow them") as refused:
+        read(write(path, table))
+    command = str(refused.value)[str(refused.value).index("awk ") :]
+    subprocess.run(["sh", "-c", command], check=True)
+    record = read(tmp_path / "my run-numbered.csv")
+    assert record.period_s == pytest.approx(1e-3, rel=0.01)
+    assert np.array_equal(record.motor_position_rad[:, 0], table[:, 1])
 
 
 HEAD = "time_s,motor1_position_rad,motor1_torque_nm\n"

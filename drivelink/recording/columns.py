@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import difflib
 import logging
+import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -209,14 +211,31 @@ def _on_grid(
         again = resampled(measured, rows)
         return again, find_grid(again["time_s"], where, nominal_s)
     if grid is None:
-        assert refused is not None
-        raise refused
+        raise RecordingError(f"{refused}{_renumber(where, nominal_s or _mean_step(columns['time_s']))}")
     _LOG.warning(
         "%s: the stamps jitter by up to %.2g periods: taken as arrival times of a uniform sampling",
         where,
         grid.jittering,
     )
     return columns, grid
+
+
+def _mean_step(time_s: FloatArray) -> float:
+    known = time_s[np.isfinite(time_s)]
+    return float(known[-1] - known[0]) / (len(known) - 1)
+
+
+def _renumber(where: str, period_s: float) -> str:
+    """What makes uniform samples of a table whose stamps say nothing of them."""
+    path = Path(where)
+    if path.suffix.lower() != ".csv":
+        return ""
+    target = path.with_stem(f"{path.stem}-numbered")
+    return (
+        ", and the motion does not follow them. If the samples are uniform, number them, time_s first: "
+        f"awk -F, -v OFS=, 'NR > 1 {{ $1 = (NR - 2) * {period_s:.3g} }} 1' {shlex.quote(str(path))} > "
+        f"{shlex.quote(str(target))}"
+    )
 
 
 class _Channels(NamedTuple):

@@ -75,8 +75,10 @@ def find_grid(
         raise RecordingError(f"{where}: expected at least {MINIMUM_ROWS} samples, got {len(time)}")
     steps = np.diff(time)
     _require_forward(steps, np.flatnonzero(keep), time, where)
-    if np.count_nonzero(steps) < 0.5 * len(steps):
+    if time[-1] == time[0]:
         raise RecordingError(f"{where}: time_s stands still: expected one stamp per sample, increasing")
+    if np.count_nonzero(steps) < 0.5 * len(steps):
+        raise NotUniformError(f"{where}: expected one stamp per sample, got most as the one before")
     period = float(np.median(steps))
     if time[-1] - time[0] > _MOST_PERIODS * period:
         raise RecordingError(f"{where}: time_s spans {time[-1] - time[0]:g} s in steps of {period:g} s")

@@ -15,7 +15,6 @@ from daemonkit import Collector, DaemonRig, Listener, rig, running, served, vsa,
 from zenohkit import free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.cycle.pipeline import make_pipeline
 from drivelink.cycle.startup import join_bus
 from drivelink.daemon import reload
 from drivelink.daemon.service import Daemon, ServedJoint
@@ -267,28 +266,6 @@ def test_a_flood_of_reloads_begins_one_in_a_while_and_forgets_none(reloadable, m
     assert begun[-1] == now_s
 
 
-def test_the_raw_frames_of_a_run_give_the_published_bytes_back_bit_for_bit():
-    joint = vsa()
-    with rig(joint) as made:
-        listener = Listener(joint)
-        layouts = tuple(made.daemon.layouts.values())
-        for at in (300, 500, 501, 502, 900):
-            made.faults.at(at, lambda: made.faults.mute(made.node(2), made.tpdo(2)[0]))
-        made.faults.at(1200, lambda: made.faults.reboot(made.node(1)))
-        made.run(3000)
-        pipeline = make_pipeline(joint, layouts)
-        again, stamp_ns = [], made.collector.estimates[0][1] - MS
-        for cob_id, data in listener.frames():
-            stamp_ns += MS * (cob_id == SYNC_COB_ID)
-            tick = pipeline.feed(cob_id, data, 1, stamp_ns)
-            if tick is not None:
-                again.append((tick.estimate_payload, tick.sample_payload))
-        assert len(again) == 3000
-        assert again == made.collector.payloads
-        listener.close()
-
-
-MS = 1_000_000
 SINGLE = """
 name = "wrist"
 [[motor]]

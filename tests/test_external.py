@@ -44,10 +44,10 @@ CERTAIN = {"inertia_std_kg_m2": 0.0, "viscous_damping_std_nm_s_rad": 0.0, "gravi
 LINK = LinkDynamics(inertia_kg_m2=0.4, viscous_damping_nm_s_rad=0.1, gravity_nm=GRAVITY_NM, **CERTAIN)
 
 
-def world(seed=1, external=None, effects=(), payload=(0.0, 0.0)):
+def world(seed=1, external=None, effects=(), payload=(0.0, 0.0), amplitude_nm=8.0):
     """A series elastic joint behind a gear with dry friction, in rich motion; payload: kg·m², N·m."""
     spring = Spring(model="polynomial", parameters={"coefficients_nm_rad": (150.0, 1500.0)})
-    table = {"kind": "rich", "amplitude_nm": 8.0, "low_hz": 0.15, "high_hz": 4.0}
+    table = {"kind": "rich", "amplitude_nm": amplitude_nm, "low_hz": 0.15, "high_hz": 4.0}
     excitation = build(table | {"centring_nm_rad": 10.0, "centring_nm_s_rad": 1.0}, 1)
     motor = MotorPlant(inertia_kg_m2=0.125, viscous_damping_nm_s_rad=0.8, spring=spring)
     inertia, gravity = 0.4 + payload[0], GRAVITY_NM + payload[1]
@@ -188,6 +188,24 @@ def test_a_link_that_is_off_by_what_is_declared_raises_no_contact(free, error):
     # It is wrong by what it says: errors that do not average out are in the standard deviation.
     off = np.abs(estimated.torque / estimated.std)[estimated.valid]
     assert 0.1 < np.sqrt(np.mean(off**2)) < 1.5
+
+
+def test_a_motor_that_friction_stops_is_not_suspected_of_a_frozen_reading():
+    """A bearing becomes tight: from then on the motor sticks for up to half a second while the link moves."""
+    joint = world(amplitude_nm=4.0)
+    joint.alter(effects=[parse("coulomb_friction=0.05")])
+    before = record(joint, 5.0)
+    joint.advance()
+    joint.alter(effects=[parse("coulomb_friction=1.5")])
+    after = record(joint, 10.0)
+    rows = {name: np.concatenate([before[name], after[name]]) for name in before}
+    moves = np.flatnonzero(np.diff(after["motor1_position_rad"]))
+    assert np.sum(np.diff(moves) > 60) > 10  # three times as long as what no reading repeats itself for
+    estimator = make_estimator(model(), EstimatorSettings(), T)
+    for sample in samples(rows):
+        estimator.step(sample)
+        suspicion = estimator.suspicion()
+        assert suspicion is None or suspicion["reason"] != "frozen", sample.sequence
 
 
 def test_friction_at_the_link_below_the_least_torque_is_no_contact():

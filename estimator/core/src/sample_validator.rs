@@ -2,6 +2,8 @@
 
 mod channels;
 
+use std::collections::VecDeque;
+
 use serde::{Deserialize, Serialize};
 
 use crate::model::Model;
@@ -52,8 +54,8 @@ pub struct Accepted {
 /// start anew from there. After a gap a place that no velocity seen so far leads to is a jump, too. A torque
 /// may jump, but one that would throw the bare motor about and is many times the largest one seen is left
 /// out unless it persists. A channel is frozen when it repeats itself exactly for longer than it has ever
-/// done in good times, while a position moves; a position only if it stopped out of motion: a link that
-/// comes to rest while the motors go on, as under a controller, is no fault.
+/// done in good times, while a position moves; a position only if it stopped dead: a link that comes to
+/// rest while the motors go on, as under a controller, is no fault, nor is a motor that friction stops.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SampleValidator {
     motors: usize,
@@ -68,6 +70,7 @@ pub struct SampleValidator {
     still: u32,
     learning: u32,
     found: Option<(Signal, Reason)>, // what is wrong with the sample at hand
+    trail: VecDeque<[f64; PLACES]>,  // the last places, of the time that a frozen channel stands at least
     memory: Memory,
 }
 
@@ -81,8 +84,7 @@ struct Memory {
     steps: [f64; PLACES], // smallest change seen of each position, or of its changes: its resolution
     limits: [f64; PLACES], // bends that are jumps
     fastest: [f64; PLACES], // changes in a period
-    rates: [f64; PLACES], // mean change in a period, of late
-    stopped_at: [f64; PLACES],
+    stopped_dead: [bool; PLACES], // rather than slowed down
     astray: [bool; PLACES],
     values: Option<[f64; CHANNELS]>,
     runs: [u32; CHANNELS],
@@ -106,8 +108,7 @@ const FRESH: Memory = Memory {
     steps: [f64::INFINITY; PLACES],
     limits: [f64::INFINITY; PLACES],
     fastest: [0.0; PLACES],
-    rates: [0.0; PLACES],
-    stopped_at: [0.0; PLACES],
+    stopped_dead: [false; PLACES],
     astray: [false; PLACES],
     values: None,
     runs: [0; CHANNELS],
@@ -130,6 +131,7 @@ impl SampleValidator {
         let lightest = model.motors.iter().map(|motor| motor.inertia).fold(f64::INFINITY, f64::min);
         let mut tame = [f64::INFINITY; MOTORS];
         model.motors.iter().zip(&mut tame).for_each(|(motor, tame)| *tame = WILD_RAD_S2 * motor.inertia);
+        let still = periods(STILL_S).max(4.0) as u32;
         SampleValidator {
             motors: model.motors.len(),
             flexible: model.has_deflection(),
@@ -140,9 +142,10 @@ impl SampleValidator {
             patience: PATIENCE.max(periods(PATIENCE_S) as u32),
             gain: TORQUE_MARGIN * period_s * period_s / lightest,
             tame,
-            still: periods(STILL_S).max(4.0) as u32,
+            still,
             learning: periods(LEARNING_S) as u32,
             found: None,
+            trail: vec![[f64::NAN; PLACES]; still as usize + 1].into(),
             memory: FRESH,
         }
     }
@@ -159,6 +162,7 @@ impl SampleValidator {
     /// Forget everything.
     pub fn reset(&mut self) {
         self.memory = FRESH;
+        self.trail.iter_mut().for_each(|places| *places = [f64::NAN; PLACES]);
     }
 
     /// Smallest change of each position (motors, then the link) or of its changes: its resolution, rad; ∞ before any.
@@ -252,7 +256,7 @@ impl SampleValidator {
         let m = &mut self.memory;
         (m.sequence, m.places) = (Some(sequence), places);
         m.slopes = [0.0; PLACES];
-        m.rates = [0.0; PLACES];
+        self.trail.iter_mut().for_each(|places| *places = [f64::NAN; PLACES]);
         m.astray = [false; PLACES];
         (m.values, m.frozen, m.seen, m.rejected) = (None, false, 0, 0);
         self.review();

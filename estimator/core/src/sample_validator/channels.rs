@@ -1,10 +1,15 @@
 //! Channels that stand still, or jump.
 
+use std::collections::VecDeque;
+
 use super::{CHANNELS, MARGIN, PLACES, SampleValidator};
 use crate::sample::MOTORS;
 use crate::suspicion::{Reason, Signal};
 
-const STOPPED_COUNTS: f64 = 10.0; // … nor is a position that was slower than so many counts in that time
+const STOPPED_COUNTS: f64 = 10.0; // … nor is a position that was slower than so many counts in that time …
+/// … or that slowed down: of the way of that time, a motor that friction brings to rest goes 1/16 in the last quarter, a
+/// reading that freezes in motion 1/4.
+const ABRUPT: f64 = 1.0 / 8.0;
 const FIRST: u32 = 8; // samples after a start that are not judged
 const ROUNDING: f64 = 1e-12; // of a position: what arithmetic may leave of counts that cancel
 
@@ -27,15 +32,13 @@ impl SampleValidator {
                 m.runs[i] += 1;
                 let run = m.runs[i];
                 if run == 1 && i < watched {
-                    m.stopped_at[i] = m.rates[i];
+                    m.stopped_dead[i] = stops_dead(&self.trail, i, m.steps[i]);
                 }
                 if m.samples < self.learning {
                     m.usual[i] = m.usual[i].max(run);
                 }
                 // A torque always counts as one that was moving before.
-                let stopped_dead =
-                    i >= watched || m.stopped_at[i] * f64::from(self.still) > STOPPED_COUNTS * m.steps[i];
-                if run > self.still && run > 3 * m.usual[i] && stopped_dead {
+                if run > self.still && run > 3 * m.usual[i] && (i >= watched || m.stopped_dead[i]) {
                     still = Some(i);
                 }
             } else {
@@ -45,6 +48,8 @@ impl SampleValidator {
                 }
             }
         }
+        self.trail.pop_front();
+        self.trail.push_back(*places);
         m.motion += 0.05 * (moving - m.motion);
         m.frozen = still.is_some() && m.motion > 0.2;
         let frozen = m.frozen;
@@ -76,7 +81,6 @@ impl SampleValidator {
                 continue;
             }
             let size = change.abs();
-            m.rates[i] += 0.1 * (size - m.rates[i]);
             // Of a joint that turns steadily no change is small; a change of the change is whole counts as well.
             let second = if m.seen > 0 && periods == m.span { bend * periods } else { 0.0 };
             for count in [size, second] {
@@ -96,4 +100,12 @@ impl SampleValidator {
         }
         jumped
     }
+}
+
+/// Whether a position that now stands did so out of motion; `count`: its resolution, which rounds its ways.
+fn stops_dead(trail: &VecDeque<[f64; PLACES]>, place: usize, count: f64) -> bool {
+    let last = trail.len() - 1;
+    let way = |periods: usize| (trail[last][place] - trail[last - periods][place]).abs();
+    let all = way(last);
+    all > STOPPED_COUNTS * count && way(last / 4) - count > ABRUPT * all
 }

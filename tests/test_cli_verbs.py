@@ -15,6 +15,7 @@ import pytest
 
 from drivelink import cli
 from drivelink.cli import main
+from drivelink.errors import UsageError
 
 NAMED = 'name = "{}"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
 
@@ -62,7 +63,7 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(verb, arguments, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "status", "line"),
     [
-        (["demo", "--seconds", "0"], 2, "argument --seconds: expected a number of seconds > 0, got 0"),
+        (["demo", "--seconds", "0"], 2, "--seconds: expected a number above 0, got 0"),
         (["run", "none.toml"], 2, "none.toml: cannot be read"),
         (["sim", "none.toml"], 2, "none.toml: cannot be read"),
         (["monitor", "elbow", "--foxglove"], 2, "--foxglove: expected a joint file"),
@@ -177,3 +178,45 @@ def test_a_console_without_unicode_gets_the_words_spelt_out(fleet):
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert "Traceback" not in done.stderr and "N*m rms left" in done.stdout and done.stdout.isascii()
+
+
+def _numeric(verb):
+    parser = cli.make_parser([verb])
+    return [
+        a for a in cli._verb_parser(parser, verb)._actions if a.option_strings and a.type not in (None, Path)
+    ]
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_a_number_that_cannot_be_is_one_line_in_every_verb(verb):
+    for action in _numeric(verb):
+        assert "add_number" in action.type.__qualname__, f"{action.option_strings}: its range is not declared"
+        (option,) = action.option_strings
+        for wrong in ("nan", "inf", "-1", "-1e9", "", "x"):
+            with pytest.raises(UsageError, match=f"^{option}: expected a .*number .*, got {wrong}$"):
+                action.type(wrong)
+
+
+@pytest.mark.parametrize(
+    ("verb", "given"),
+    [
+        ("monitor", "--every 0"),
+        ("monitor", "--seconds 0"),
+        ("monitor", "--port 65536"),
+        ("run", "a.toml --seconds 0"),
+        ("record", "a.toml --out a.csv --seconds 0"),
+        ("replay", "a.csv --speed 0"),
+        ("compare", "a b --horizon 0"),
+        ("diagnose", "a.csv --motion-seconds 3.9"),
+        ("doctor", "--seconds 3601"),
+        ("fleet", "a --joints . --workers 0"),
+        ("new", "--node 0"),
+        ("new", "--gear 0"),
+        ("fit", "a.csv --bandwidth-hz 0"),
+    ],
+)
+def test_a_zero_or_what_is_beyond_the_range_is_refused_before_anything_is_read(verb, given, capsys):
+    assert main([verb, *given.split()]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    option, value = given.split()[-2:]
+    assert line.startswith(f"drivelink {verb}: {option}: expected a ") and line.endswith(f", got {value}")

@@ -15,7 +15,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from drivelink.errors import DrivelinkError, UsageError
 from drivelink.plaintext import PlainFormatter, clean_text, spell_out
@@ -181,9 +181,9 @@ def add_recordings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--joint", type=Path, metavar="JOINT", help="joint file (default: the one in the recording)"
     )
-    parser.add_argument(
+    add_number(
+        parser,
         "--bandwidth-hz",
-        type=_bandwidth,
         metavar="F",
         help="bandwidth of the filter that all channels share (default: chosen from the data)",
     )
@@ -214,15 +214,43 @@ def warn(path: Path, lines: Sequence[str]) -> None:
         print(f"{path}: warning: {line}", file=sys.stderr)
 
 
-def _bandwidth(text: str) -> float:
-    """A number above 0, as `--bandwidth-hz` wants it."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise UsageError(f"--bandwidth-hz: expected a number above 0, got {text}")
-    return value
+def add_number(
+    parser: argparse.ArgumentParser,
+    option: str,
+    *,
+    least: float | None = None,
+    most: float = math.inf,
+    whole: bool = False,
+    **how: Any,
+) -> None:
+    """Add an option that takes a finite number; what is none, or out of range, is one line.
+
+    Args:
+        least: smallest value; None: above 0.
+        most: largest value.
+        whole: take whole numbers only.
+        how: further arguments of `add_argument`.
+    """
+    lower = "above 0" if least is None else f"from {least:g}" if most < math.inf else f"of {least:g} or more"
+    upper = "" if most == math.inf else f" to {most:g}"
+    expected = f"expected a {'whole ' if whole else ''}number {lower}{upper}"
+
+    def number(text: str) -> float:
+        try:
+            value = int(text) if whole else float(text)
+        except ValueError:
+            value = math.nan
+        enough = value > 0.0 if least is None else value >= least
+        if not (enough and value <= most and value < math.inf):
+            raise UsageError(f"{option}: {expected}, got {text}")
+        return value
+
+    parser.add_argument(option, type=number, **how)
+
+
+def add_seconds(parser: argparse.ArgumentParser, ends: str = "with Ctrl-C") -> None:
+    """Add `--seconds`, for the verbs that run until they are stopped."""
+    add_number(parser, "--seconds", metavar="S", help=f"end after S seconds (default: {ends})")
 
 
 def add_bus(parser: argparse.ArgumentParser) -> None:

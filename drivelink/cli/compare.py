@@ -8,8 +8,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from drivelink.cli import add_map
-from drivelink.errors import RecordingError, UsageError
+from drivelink.cli import add_map, add_number
+from drivelink.errors import RecordingError
 from drivelink.files import write_whole
 
 EPILOG = """\
@@ -30,7 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("a", type=Path, metavar="A", help="joint file or recording")
     parser.add_argument("b", type=Path, metavar="B", help="joint file or recording")
     parser.add_argument("--joint", type=Path, metavar="JOINT", help="joint file of the recordings")
-    parser.add_argument("--horizon", type=float, metavar="S", help="time between new starts of a free run")
+    add_number(parser, "--horizon", metavar="S", help="time between new starts of a free run")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="write comparison.json and comparison.html there"
     )
@@ -42,8 +42,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
-    if args.horizon is not None and not args.horizon > 0.0:
-        raise UsageError(f"--horizon: expected a number of seconds above 0, got {args.horizon:g}")
     for path in (args.a, args.b):
         if not path.exists():
             raise RecordingError(f"{path}: no such file")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import math
 import shutil
 import tempfile
 from importlib import resources
@@ -14,6 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from drivelink import jointfile
+from drivelink.cli import add_number
 from drivelink.cli.blackbox import black_box
 from drivelink.demo import closedloop
 from drivelink.demo.closing import as_json, closing_table
@@ -39,22 +39,15 @@ examples:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `demo`."""
     parser.add_argument("--case", choices=CASES, default="vsa-ii", help="which joint, and what happens to it")
-    parser.add_argument(
+    add_number(
+        parser,
         "--seconds",
-        type=_seconds,
         metavar="S",
         help="of the run (default: 10; where the loop closes, at most 180)",
     )
     parser.add_argument("--yes", action="store_true", help="accept without asking, where the loop closes")
     parser.add_argument("--headless", action="store_true", help="plain lines instead of the live view")
     parser.add_argument("--json", action="store_true", help="print one line of JSON and nothing else")
-
-
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"expected a number of seconds > 0, got {text}")
-    return value
 
 
 def run(args: argparse.Namespace) -> int:

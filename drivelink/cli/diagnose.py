@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from drivelink import analysis
-from drivelink.cli import add_recordings, require_distinct, warn
+from drivelink.cli import add_number, add_recordings, require_distinct, warn
 from drivelink.errors import HarmfulModelError, UsageError
 from drivelink.files import check_target
 from drivelink.output.document import show
@@ -49,8 +49,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="design the motion that tells apart what is left open, within [motion] of the joint file: a CSV "
         "file for the controller and `drivelink sim --motion`, a picture beside it",
     )
-    parser.add_argument(
-        "--motion-seconds", type=float, default=12.0, metavar="S", help="its length (default: %(default)g)"
+    add_number(
+        parser,
+        "--motion-seconds",
+        least=4.0,
+        most=120.0,
+        default=12.0,
+        metavar="S",
+        help="its length (default: %(default)g)",
     )
     parser.add_argument("--force", action="store_true", help="replace the files of --write and --motion")
     parser.add_argument(
@@ -68,8 +74,6 @@ def run(args: argparse.Namespace) -> int:
     if args.motion is not None:
         if args.motion.suffix.lower() != ".csv":
             raise UsageError(f"--motion: expected a name that ends with .csv, got {args.motion}")
-        if not 4.0 <= args.motion_seconds <= 120.0:
-            raise UsageError(f"--motion-seconds: expected 4 to 120, got {args.motion_seconds:g}")
         for path in (args.motion, args.motion.with_suffix(".png")):
             check_target(path, inputs, force=args.force)
     for name in ("report.json", "report.html"):

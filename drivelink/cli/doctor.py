@@ -12,7 +12,7 @@ from typing import TextIO
 
 from rich.console import Console
 
-from drivelink.cli import add_bus, moved
+from drivelink.cli import add_bus, add_number, moved
 from drivelink.doctor import examine, examine_eds
 from drivelink.doctor.livevalues import live_values
 from drivelink.doctor.manualcheck import check_by_hand
@@ -39,9 +39,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "joint", nargs="?", type=Path, metavar="JOINT", help="joint file; without: the machine"
     )
     parser.add_argument("--eds", type=Path, metavar="FILE", help="what the drive of this EDS or DCF can send")
-    parser.add_argument(
+    add_number(
+        parser,
         "--seconds",
-        type=float,
+        most=3600.0,
         metavar="S",
         help=f"for each measurement (default: {_EXAMINED_S:g}, with --move {_AT_REST_S:g})",
     )
@@ -55,8 +56,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Examine, print, and return 1 if a problem prevents operation."""
     seconds = args.seconds if args.seconds is not None else _AT_REST_S if args.move else _EXAMINED_S
-    if not 0 < seconds <= 3600:
-        raise UsageError(f"--seconds: expected more than 0 and at most 3600, got {seconds:g}")
     if args.joint is None and (args.interface or args.channel):
         raise UsageError("--interface and --channel: expected a joint file, whose bus they replace")
     if args.eds is not None:

@@ -10,6 +10,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drivelink.cli import add_number
 from drivelink.errors import UsageError
 from drivelink.output.progress import Meter
 from drivelink.plaintext import clean_text
@@ -65,8 +66,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="accept a scheduler without TLS: anybody who reaches it runs code on its workers",
     )
-    parser.add_argument(
-        "--workers", type=int, metavar="N", help="processes on this machine (default: one per CPU core)"
+    add_number(
+        parser,
+        "--workers",
+        whole=True,
+        metavar="N",
+        help="processes on this machine (default: one per CPU core)",
     )
     parser.add_argument(
         "--memory",
@@ -110,8 +115,6 @@ def _settings(args: argparse.Namespace) -> Settings:
 
     if args.joints is None:
         raise UsageError("--joints: expected the folder of the joint files")
-    if args.workers is not None and args.workers < 1:
-        raise UsageError(f"--workers: expected 1 or more, got {args.workers}")
     if args.workers is not None and args.scheduler is not None:
         raise UsageError("--workers: expected without --scheduler, whose workers are started elsewhere")
     since = None if args.since is None else _since(args.since)

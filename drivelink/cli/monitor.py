@@ -14,6 +14,7 @@ from rich.live import Live
 from rich.text import Text
 
 from drivelink import jointfile
+from drivelink.cli import add_number, add_seconds
 from drivelink.errors import UsageError
 from drivelink.loop.finding import folder_of
 from drivelink.monitor.statuslines import shape
@@ -45,15 +46,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--foxglove", action="store_true", help="serve JOINT's messages to Foxglove Studio and PlotJuggler"
     )
-    parser.add_argument(
-        "--port", type=int, default=8765, help="port of the page (default %(default)s, 0: any)"
+    add_number(
+        parser,
+        "--port",
+        least=0,
+        most=65535,
+        whole=True,
+        default=8765,
+        help="port of the page (default %(default)s, 0: any)",
     )
-    parser.add_argument(
-        "--seconds", type=float, metavar="S", help="end after S seconds (default: with Ctrl-C)"
-    )
-    parser.add_argument(
+    add_seconds(parser)
+    add_number(
+        parser,
         "--every",
-        type=float,
         default=1.0,
         metavar="S",
         help="interval of the plain lines (default: %(default)s)",
@@ -78,8 +83,6 @@ def add_zenoh(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
-    if args.port < 0 or args.port > 65535:
-        raise UsageError(f"--port: expected 0 to 65535, got {args.port}")
     if args.web and args.json:
         raise UsageError("expected either --web or --json")
     acceptance = None

@@ -18,6 +18,7 @@ import tomlkit
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.newfile import Answers, answers_from_bus, joint_text
 from drivelink.canopen.scan import identify, scan
+from drivelink.cli import add_number
 from drivelink.errors import UsageError
 from drivelink.files import check_target, write_whole
 from drivelink.jointfile import BusSection, parse
@@ -44,28 +45,36 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scan", action="store_true", help="take the nodes from what answers on the bus")
     parser.add_argument("--name", help="name of the joint")
     parser.add_argument("--arrangement", choices=_ARRANGEMENTS, help="how the motors act on the joint")
-    parser.add_argument(
-        "--rotor-inertia", type=float, metavar="G_CM2", help="rotor inertia of each motor, g·cm² (data sheet)"
+    add_number(
+        parser,
+        "--rotor-inertia",
+        metavar="G_CM2",
+        help="rotor inertia of each motor, g·cm² (data sheet)",
     )
-    parser.add_argument(
-        "--inertia", type=float, metavar="KG_M2", help="instead: inertia of each motor, joint side"
-    )
-    parser.add_argument(
+    add_number(parser, "--inertia", metavar="KG_M2", help="instead: inertia of each motor, joint side")
+    add_number(
+        parser,
         "--torque-constant",
-        type=float,
         metavar="MNM_A",
         help="torque constant of each motor, mN·m/A, if the drive reports no torque",
     )
-    parser.add_argument("--damping", type=float, metavar="NM_S_RAD", help="damping of each motor, joint side")
+    add_number(parser, "--damping", least=0.0, metavar="NM_S_RAD", help="damping of each motor, joint side")
     parser.add_argument("--model", choices=_MODELS, help="model of the transmission")
-    parser.add_argument(
-        "--node", type=int, action="append", metavar="ID", help="node ID of a drive; twice for a VSA"
+    add_number(
+        parser,
+        "--node",
+        least=1,
+        most=127,
+        whole=True,
+        action="append",
+        metavar="ID",
+        help="node ID of a drive; twice for a VSA",
     )
-    parser.add_argument("--gear", type=float, metavar="RATIO", help="motor revolutions per joint revolution")
+    add_number(parser, "--gear", metavar="RATIO", help="motor revolutions per joint revolution")
     parser.add_argument("--encoder", metavar="drive|none|ID", help="link encoder: ID of a CiA 406 node")
     parser.add_argument("--interface", help="python-can interface (default: socketcan)")
     parser.add_argument("--channel", help="python-can channel (default: can0)")
-    parser.add_argument("--bitrate", type=int, help="bit/s (default: 1000000)")
+    add_number(parser, "--bitrate", whole=True, help="bit/s (default: 1000000)")
     parser.add_argument("--passive", action="store_true", help="another master controls the bus")
     parser.add_argument("--force", action="store_true", help="replace PATH if it exists")
     parser.add_argument("--json", action="store_true", help="print what was made as one JSON object")

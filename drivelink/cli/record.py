@@ -20,7 +20,7 @@ from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cli import add_bus, moved
+from drivelink.cli import add_bus, add_seconds, moved
 from drivelink.errors import BusError, DrivelinkError, RecordingError, UsageError, ZenohError
 from drivelink.files import check_target
 from drivelink.jointfile import JointFile, JointText
@@ -59,9 +59,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("joint", type=Path, metavar="JOINT", help="joint file")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the recording")
-    parser.add_argument(
-        "--seconds", type=float, metavar="S", help="end after S seconds (default: with Ctrl-C)"
-    )
+    add_seconds(parser)
     parser.add_argument(
         "--source",
         choices=("auto", "daemon", "bus"),

@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from drivelink.cli import add_map, warn
-from drivelink.errors import UsageError
+from drivelink.cli import add_map, add_number, warn
 from drivelink.files import check_target
 from drivelink.jointfile import JointFile
 from drivelink.output.progress import Meter
@@ -50,9 +49,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace the CSV of --out if it exists")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="write plots of the estimates")
     parser.add_argument("--publish", action="store_true", help="put samples and estimates on zenoh")
-    parser.add_argument(
+    add_number(
+        parser,
         "--speed",
-        type=float,
         metavar="X",
         help="X times the speed of the recording (default: as fast as it goes)",
     )
@@ -69,8 +68,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
-    if args.speed is not None and not args.speed > 0:
-        raise UsageError(f"--speed: expected a number above 0, got {args.speed:g}")
     source = joint_of(args.file, args.joint)
     joint, base_dir = source.joint, source.folder
     names = parse_column_map(args.map)

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from drivelink.cli import ALONE, add_bus, moved
+from drivelink.cli import ALONE, add_bus, add_seconds, moved
 from drivelink.errors import UsageError
 from drivelink.jointfile import BusSection, load
 from drivelink.plaintext import PlainFormatter, stamped
@@ -42,9 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "joints", nargs="+", type=Path, metavar="JOINT", help="joint files; several share one bus"
     )
-    parser.add_argument(
-        "--seconds", type=float, metavar="S", help="end after S seconds (default: run until stopped)"
-    )
+    add_seconds(parser, "run until stopped")
     add_bus(parser)
     parser.add_argument("--no-publish", action="store_true", help="compute, but publish nothing")
     parser.add_argument(

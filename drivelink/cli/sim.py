@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from drivelink.cli import ALONE, add_bus
+from drivelink.cli import ALONE, add_bus, add_number, add_seconds
 from drivelink.cycle.realtime import PRIORITY, acquire, release
 from drivelink.demo.simbus import JoinedBus, open_sim_bus, require_free
 from drivelink.demo.simulate import assumptions, bench_from_joints
@@ -52,10 +52,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--quirks", metavar="NAME", help="drives that behave like a vendor's, e.g. epos4; see the reference"
     )
     add_bus(parser)
-    parser.add_argument(
-        "--seconds", type=float, metavar="S", help="end after S seconds (default: with Ctrl-C)"
-    )
-    parser.add_argument("--seed", type=int, help="seed of the sensor noise")
+    add_seconds(parser)
+    add_number(parser, "--seed", least=0, whole=True, help="seed of the sensor noise")
     parser.add_argument(
         "--write-eds", type=Path, metavar="DIR", help="also write the EDS file of every simulated node"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import signal
 import sys
@@ -58,9 +59,12 @@ class Settings:
         if self.memory is None:
             return 0.0
         try:
-            return float(parse_bytes(self.memory))
-        except ValueError as error:
-            raise FleetError(f'--memory: expected a size such as 2GiB, got "{self.memory}"') from error
+            size = float(parse_bytes(self.memory))
+        except (ValueError, OverflowError):
+            size = math.nan
+        if not 0.0 < size < math.inf:
+            raise FleetError(f'--memory: expected a size such as 2GiB, got "{self.memory}"')
+        return size
 
 
 @dataclass(slots=True)

@@ -83,8 +83,6 @@ def run(args: argparse.Namespace) -> int:
     source = replace(source, joint=moved(source.joint, args))
     joint = source.joint
     check_target(args.out, [args.joint], force=args.force)
-    if args.seconds is not None and not args.seconds > 0:
-        raise UsageError(f"--seconds: expected a number above 0, got {args.seconds:g}")
     if args.layouts is not None:
         write_layouts(joint, args.layouts)
     stopped = threading.Event()

@@ -16,7 +16,6 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from drivelink.cli import ALONE, add_bus, add_seconds, moved
-from drivelink.errors import UsageError
 from drivelink.jointfile import BusSection, load
 from drivelink.plaintext import PlainFormatter, stamped
 
@@ -62,8 +61,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the joints until stopped."""
-    if args.seconds is not None and not args.seconds > 0:
-        raise UsageError(f"--seconds: expected a number > 0, got {args.seconds:g}")
     _set_up_logging(args.log_level)
     loaded = [moved(load(path), args) for path in args.joints]
     if loaded[0].bus.interface == "virtual":

@@ -62,8 +62,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the devices until SIGINT, SIGTERM or the end of `--seconds`."""
-    if args.seconds is not None and not args.seconds > 0:
-        raise UsageError(f"--seconds: expected a number > 0, got {args.seconds:g}")
     joints = [load(path) for path in args.joints]
     if args.motion is not None:
         joints = [_moving(joint, args.motion) for joint in joints]

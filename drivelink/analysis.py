@@ -73,9 +73,9 @@ class Runs:
         return ", ".join(path.name for path in self.paths)
 
     @property
-    def inputs(self) -> list[Path]:
-        """Files that no result may replace, but for the joint file."""
-        return list(self.paths)
+    def units(self) -> Units:
+        """Units of a rotary or linear axis."""
+        return Units(self.source.joint.axis == "linear")
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ class Fit:
             DrivelinkError: the file exists, is an input, or cannot be written.
         """
         path, runs = Path(target), self.runs
-        check_target(path, runs.inputs, force=force)
+        check_target(path, runs.paths, force=force)
         self._require_stiffness()
         if harmful := self._harm():
             named = ", ".join(map(str, runs.paths))
@@ -162,18 +162,17 @@ class Fit:
         return path
 
     def _harm(self) -> str | None:
-        joint = self.runs.source.joint
-        declared = joint.model()
+        declared = self.runs.source.joint.model()
 
         def make(records: Sequence[Record]) -> JointModel:
             found = identify(records, declared, self.bandwidth_rad_s)
             return as_read(found.model, records, found.surplus)
 
         written = as_read(self.found.model, self.runs.records, self.found.surplus)
-        return harm_of_parts(declared, written, self.runs.records, make, joint.estimator)
+        return harm_of_parts(declared, written, self.runs.records, make, self.runs.source.joint.estimator)
 
     def _require_stiffness(self) -> None:
-        named = ", ".join(map(str, self.runs.paths))
+        named = self.runs.named
         flexible = [(i, one) for i, one in enumerate(self.found.fits, start=1) if one.model != RIGID]
         for number, one in flexible:
             if not one.excited:
@@ -217,11 +216,8 @@ class Diagnosed:
 
     def sections(self) -> list[Section]:
         """Return what the report describes and draws."""
-        units = Units(self.runs.source.joint.axis == "linear")
-        made = report.sections(self.documented, units)
-        if self.motion is not None:
-            made.append(motions.section(self.motion, units))
-        return made
+        made = report.sections(self.documented, self.runs.units)
+        return made if self.motion is None else [*made, motions.section(self.motion, self.runs.units)]
 
     def report(self, folder: str | Path) -> list[Path]:
         """Write report.json and report.html into a folder."""
@@ -230,8 +226,8 @@ class Diagnosed:
         title = report.Title(joint.name, self.runs.named, self.validated, joint.axis == "linear")
         written = diagnosed_model(joint, self.outcome)
         record = self.runs.records[0] if self.held is None else self.held
-        made = beside(self.runs.named, joint.model(), written, record, Units(title.linear))
-        more = [*([] if self.motion is None else [motions.section(self.motion, Units(title.linear))]), *made]
+        made = beside(self.runs.named, joint.model(), written, record, self.runs.units)
+        more = [*([] if self.motion is None else [motions.section(self.motion, self.runs.units)]), *made]
         return report.write(self.as_json(), report.html_page(self.documented, title, more), out)
 
     def next_motion(
@@ -266,13 +262,11 @@ class Diagnosed:
         """
         if self.motion is None:
             raise UsageError("expected a motion, next_motion() designs one")
-        return motions.write(
-            self.motion, Path(target), Units(self.runs.source.joint.axis == "linear"), force=force
-        )
+        return motions.write(self.motion, Path(target), self.runs.units, force=force)
 
     def plot(self) -> Picture:
         """Draw what the model leaves of the motor torque over time (N·m), before and after."""
-        return Picture(report.residual_figure(self.outcome, Units(self.runs.source.joint.axis == "linear")))
+        return Picture(report.residual_figure(self.outcome, self.runs.units))
 
     def write(self, target: str | Path, *, force: bool = False) -> Path:
         """Write a copy of the joint file with the effects found and the transmission refitted.
@@ -286,7 +280,7 @@ class Diagnosed:
             DrivelinkError: the file exists, is an input, or cannot be written.
         """
         path, runs = Path(target), self.runs
-        check_target(path, runs.inputs, force=force)
+        check_target(path, runs.paths, force=force)
         if harmful := self._harm():
             raise HarmfulModelError(f"{runs.named}: --write: {harmful}: no joint file is written")
         apply_diagnosis.write(runs.source, path, self.outcome, runs.records[0], runs.named, force=force)

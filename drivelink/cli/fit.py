@@ -64,7 +64,6 @@ def _fit(args: argparse.Namespace, folder: Path | None) -> None:
     from drivelink import analysis  # takes a second; the arguments are checked
     from drivelink.output.document import show
     from drivelink.output.fitreport import sections
-    from drivelink.output.numbers import Units
 
     options = {"bandwidth_hz": args.bandwidth_hz, "names": args.map, "strict": args.strict}
     made = analysis.fit(args.recording, args.joint, warn=warn, **options)
@@ -72,7 +71,7 @@ def _fit(args: argparse.Namespace, folder: Path | None) -> None:
     if args.json:
         print(json.dumps(document))
     else:  # before anything is written: a full disk loses no result
-        units = Units(made.runs.source.joint.axis == "linear")
+        units = made.runs.units
         show(sections(made.found, [path.name for path in args.recording], units), Console())
     written = []
     if args.out is not None:

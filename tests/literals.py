@@ -45,7 +45,7 @@ REASONS: dict[str, dict[str, str]] = {
     "diagnosis/shape.py": {"15.0 30.0 60.0": "quintic smooth step, its slope and bend"},
     "filters.py": {"14.0": "time constants until e^-14 is below 1e-6"},
     "gate/causes.py": {"1.3": "a factor this near to a unit's is that unit"},
-    "gate/evidence.py": {
+    "gate/balance.py": {
         "0.002 0.998": "quantiles of what was measured",
         "20.0": "third differences of white noise have 20 times its variance",
         "60.0": "periods in a recording, at least",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from estimator.gate.causes import Change, Kind
-from estimator.gate.judge import Discrepancy, Judgement, examine, judge
+from estimator.gate.decision import Discrepancy, Judgement, examine, judge
 from estimator.gate.usable import check
 
 __all__ = ["Change", "Discrepancy", "Judgement", "Kind", "check", "examine", "judge"]

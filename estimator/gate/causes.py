@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from estimator.choices import choice
-from estimator.gate.evidence import Scales
+from estimator.gate.balance import Scales
 from estimator.model import JointModel
 
 __all__ = ["Cause", "Change", "Kind", "causes", "scales"]

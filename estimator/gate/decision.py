@@ -11,8 +11,8 @@ import numpy as np
 
 from estimator.choices import choice, log_odds, whole
 from estimator.errors import EstimatorError
+from estimator.gate.balance import Balance, Fit, Scales
 from estimator.gate.causes import Cause, Change, Kind, causes, scales
-from estimator.gate.evidence import Balance, Fit, Scales
 from estimator.model import JointModel, Motor
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray, Record

@@ -73,12 +73,6 @@ def _report_judgement(section: Section, joint: JointFile, judgement: Judgement, 
         section.ok(joint.name, text)
 
 
-def slope(x: Sequence[float], y: Sequence[float]) -> float:
-    """Return the least-squares factor k of y = k x."""
-    square = sum(a * a for a in x)
-    return sum(a * b for a, b in zip(x, y, strict=True)) / square if square else 0.0
-
-
 def judge_motion(section: Section, survey: NodeSurvey, readings: Readings) -> bool:
     """Compare the channels of a drive; return whether the motor moved."""
     subject, key, motor = survey.role.subject, survey.role.key, survey.role.motor
@@ -96,44 +90,37 @@ def judge_motion(section: Section, survey: NodeSurvey, readings: Readings) -> bo
         )
         return False
     velocity = readings.get((Signal.MOTOR_VELOCITY, motor))
+    windows = _windows(times)
     if velocity is not None:
-        _judge_velocity(section, subject, key, *_differences(times, moved, velocity.values))
+        reported = [float(np.mean(velocity.values[start : end + 1])) for start, end in windows]
+        rates = [(moved[end] - moved[start]) / (times[end] - times[start]) for start, end in windows]
+        _judge_velocity(section, subject, key, _slope(reported, rates))
     link = readings.get((Signal.LINK_POSITION, None))
     if link is not None and Signal.LINK_POSITION in survey.available:
-        _judge_link(section, subject, slope(_steps(times, moved), _steps(times, link.values)))
+        motor_steps, link_steps = (
+            [x[end] - x[start] for start, end in windows] for x in (moved, link.values)
+        )
+        _judge_link(section, subject, _slope(motor_steps, link_steps))
     return True
 
 
-def _steps(times: Sequence[float], values: Sequence[float]) -> list[float]:
-    """Differences over at least the window."""
-    steps = []
-    start = 0
+def _windows(times: Sequence[float]) -> list[tuple[int, int]]:
+    """First and last place of each window, one after the other."""
+    found, start = [], 0
     for k in range(1, len(times)):
         if times[k] - times[start] >= _WINDOW_S:
-            steps.append(values[k] - values[start])
+            found.append((start, k))
             start = k
-    return steps
+    return found
 
 
-def _differences(
-    times: Sequence[float], position: Sequence[float], velocity: Sequence[float]
-) -> tuple[list[float], list[float]]:
-    """Mean velocity of each window: as reported, and from the positions."""
-    reported, differenced = [], []
-    start = 0
-    for k in range(1, len(times)):
-        span_s = times[k] - times[start]
-        if span_s >= _WINDOW_S:
-            differenced.append((position[k] - position[start]) / span_s)
-            reported.append(sum(velocity[start : k + 1]) / (k + 1 - start))
-            start = k
-    return reported, differenced
+def _slope(x: Sequence[float], y: Sequence[float]) -> float:
+    """The least-squares factor k of y = k x."""
+    square = float(np.dot(x, x))
+    return float(np.dot(x, y)) / square if square else 0.0
 
 
-def _judge_velocity(
-    section: Section, subject: str, key: str, reported: list[float], differenced: list[float]
-) -> None:
-    ratio = slope(reported, differenced)
+def _judge_velocity(section: Section, subject: str, key: str, ratio: float) -> None:
     section.facts[f"{subject} velocity_ratio"] = ratio
     text = f"positions change {ratio:.3g} times as fast as the reported velocity 0x606C"
     if abs(ratio - 1) <= _TOLERANCE:

@@ -61,13 +61,13 @@ PROTECTIONS = [
         ("identity of a node", "canopen/passive.py", "            self._check_identity()\n", "            pass\n", f"{FOLLOWING} tests/test_canopen_passive.py"),
         ("silence of a node", "cycle/following.py", "        if silent:\n", "        if False:\n", f"{FOLLOWING} -k not_heard"),
         ("receive overflow", "daemon/supervision.py", "if unread > self._unread:", "if False:", f"{FOLLOWING} -k overflow"),
-        ("foreign pages", "monitor/web.py", 'origin not in (None, f"http://{host}")', "False", "tests/test_monitor.py"),
-        ("open streams", "monitor/web.py", "in _OWN_PAGES\n        ):\n            self._events()", "in _OWN_PAGES or True\n        ):\n            self._events()", "tests/test_monitor.py"),
+        ("foreign pages", "monitor/web.py", 'origin not in (None, f"http://{host}")', "False", "tests/test_web.py"),
+        ("open streams", "monitor/web.py", "in _OWN_PAGES\n        ):\n            self._events()", "in _OWN_PAGES or True\n        ):\n            self._events()", "tests/test_web.py"),
         ("claims of a joint", "pubsub/feed.py", "if len(self._claims) < MAX_CLAIMS:", "if True:", "tests/test_network_attacks.py -k tokens"),
         ("messages of others", "pubsub/feed.py", "if not (free and vouched):", "if False:", "tests/test_network_attacks.py -k 'stays or who_speaks'"),
         ("valid and impossible", "pubsub/wire.py", "if message.status & _VALID and not _usable(message):", "if False:", "tests/test_wire.py"),
         ("floods of queries", "pubsub/publisher.py", "zenoh.handlers.RingChannel(_QUERIES)", "zenoh.handlers.FifoChannel(10_000)", "tests/test_publisher.py -k flood"),
-        ("a scheduler with certificates", "fleet/runner.py", 'if not address.startswith("tls://") and not insecure:', "if False:", "tests/test_fleet.py -k certificates"),
+        ("a scheduler with certificates", "fleet/runner.py", 'if not address.startswith("tls://") and not insecure:', "if False:", "tests/test_fleet_run.py -k certificates"),
     )
 ]  # fmt: skip
 

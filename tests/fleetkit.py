@@ -74,3 +74,12 @@ def served(folder: Path) -> Iterator[str]:
         yield f"http://127.0.0.1:{server.server_port}"
         server.shutdown()
         thread.join()
+
+
+def ids(folder: Path) -> list[str]:
+    """The ids of the rows in a table."""
+    from pyarrow import parquet
+
+    """As DuckDB or pandas would see them."""
+    parts = sorted(folder.glob("table/*.parquet"))
+    return sorted(name for part in parts for name in parquet.read_table(part)["id"].to_pylist())

@@ -25,15 +25,14 @@ from drivelink.jointfile import parse
 from drivelink.pubsub.publisher import JointPublisher, describe_model, to_json
 from drivelink.pubsub.session import close_session, open_client, open_session
 from drivelink.pubsub.wire import EstimateMessage
-from drivelink.recording import read
-from drivelink.recording.formats import FORMATS as READ
+from drivelink.recording import formats, read
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import mapping_document, recorded_layouts
 from drivelink.recording.playback import open_playback
 from drivelink.recording.sinks import Sink
 from estimator.sample import Estimate, Status
 
-FORMATS = tuple(ending for ending, kind in READ.items() if kind.sink)
+FORMATS = tuple(ending for ending, kind in formats.FORMATS.items() if kind.sink)
 BEGIN_NS = 1_700_000_000_000_000_000
 CYCLES = 400
 

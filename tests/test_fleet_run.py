@@ -1,0 +1,208 @@
+"""A run over a fleet: whatever is killed, nothing is lost or doubled, and nobody else gets in."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import fleetkit
+import pytest
+
+REASON = "the extra [fleet] is not installed"
+pytest.importorskip("distributed", reason=REASON)
+pq = pytest.importorskip("pyarrow.parquet", reason=REASON)
+
+from drivelink.cli import main  # noqa: E402
+from drivelink.fleet import runner, storage  # noqa: E402
+from drivelink.fleet.joints import Joints  # noqa: E402
+from drivelink.fleet.storage import Store  # noqa: E402
+from drivelink.fleet.table import read_rows  # noqa: E402
+
+# Dask's own: a process that was ended on purpose leaves sockets behind.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fleetkit.make_fleet(tmp_path_factory.mktemp("fleet"))
+
+
+def run_fleet(fleet: Path, out: Path, *more: str, recordings: Path | None = None) -> int:
+    joints = str(fleet / "joints")
+    return main(
+        ["fleet", str(recordings or fleet / "recordings"), "--joints", joints, "--out", str(out), *more]
+    )
+
+
+@pytest.mark.timeout(300)  # starts a cluster of its own
+@pytest.mark.slow
+def test_from_recordings_to_a_page(fleet, tmp_path, capsys):
+    recordings = shutil.copytree(fleet / "recordings", tmp_path / "recordings")
+    (recordings / "wrist-2026-01-05.csv").unlink()
+    shutil.copy(recordings / "elbow-2026-01-05.csv", recordings / "elbow-2026-01-05-copy.csv")
+    (recordings / "elbow-2026-01-07.csv").write_text("nothing")
+    out = tmp_path / "out"
+    assert run_fleet(fleet, out, "--workers", "1", "--validate", "previous", recordings=recordings) == 0
+    said = capsys.readouterr()
+    assert "5 recordings: 3 done, 1 there already, 1 broken" in said.out
+    assert "elbow-2026-01-07.csv" in said.err
+    rows = read_rows(Store(str(out)))
+    assert sorted((r["joint"], r["status"]) for r in rows) == [("elbow", "done")] * 2 + [
+        ("elbow", "error"), ("wrist", "done"),
+    ]  # fmt: skip
+    document = json.loads((out / "fleet.json").read_text())
+    assert document["schema"] == "drivelink.fleet/1"
+    assert {one["joint"]: one["recordings"] for one in document["joints"]} == {"elbow": 3, "wrist": 1}
+    page = (out / "fleet.html").read_text()
+    assert not re.search(
+        r"""(?:src|href)=["']?(?:\w+:)?//|url\(|@import|<script|<link""", page
+    )  # self-contained
+    for r in rows:
+        assert r["status"] == "error" or (out / r["report"]).exists()
+        assert r["report"] is None or r["report"] in page
+    # earlier ones are left out; once more nothing is done, nothing is lost
+    assert run_fleet(fleet, out, "--since", "2026-01-06", recordings=recordings) == 0
+    assert "too early" in capsys.readouterr().out
+    before = fleetkit.ids(out)
+    assert run_fleet(fleet, out, recordings=recordings) == 0
+    assert "0 done, 5 there already" in capsys.readouterr().out
+    assert fleetkit.ids(out) == before
+    assert main(["fleet", "report", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads((out / "fleet.json").read_text())
+
+
+@pytest.mark.slow
+def test_a_killed_worker_loses_nothing_and_doubles_nothing(fleet, tmp_path):
+    import dask
+    from distributed import Client, LocalCluster, Security
+
+    secret, files = Security.temporary(), {}
+    for name in ("ca-file", "client.cert", "client.key"):
+        path = tmp_path / name
+        path.write_text(getattr(secret, f"tls_{name.replace('-', '_').replace('.', '_')}"))
+        files[f"distributed.comm.tls.{name}"] = str(path)
+    sources, _ = storage.find([str(fleet / "recordings")])
+    with (
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", security=secret
+        ) as cluster,
+        dask.config.set(files),
+    ):
+        address, killed = cluster.scheduler_address, []
+
+        def kill_one(counts: runner.Counts) -> None:
+            if not killed:
+                with Client(address, set_as_default=False) as client:
+                    killed.append(client.run(os.getpid).popitem()[1])
+                os.kill(killed[0], signal.SIGKILL)
+
+        settings = runner.Settings(scheduler=address)
+        counts = runner.run(sources, Joints.load(fleet / "joints"), Store(str(tmp_path)), settings, kill_one)
+    assert killed
+    assert (counts.done, counts.broken) == (len(sources), 0)
+    assert sorted(r["recording"] for r in read_rows(Store(str(tmp_path)))) == [one.url for one in sources]
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_what_is_finished(fleet, tmp_path):
+    recordings = tmp_path / "recordings"
+    recordings.mkdir()
+    lines = (fleet / "recordings" / "elbow-2026-01-05.csv").read_text().splitlines(keepends=True)
+    for k in range(40):  # each is a content of its own
+        (recordings / f"elbow-{k:02d}.csv").write_text("".join(lines[: len(lines) - k]))
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "drivelink", "fleet", str(recordings), "--joints", str(fleet / "joints")]
+    command += ["--out", str(out), "--workers", "1"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    end = time.monotonic() + 90
+    while len(list(out.glob("diagnoses/*/*/report.html"))) < 3 and time.monotonic() < end:
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in error
+    assert 3 <= len(read_rows(Store(str(out)))) < 40
+
+
+def test_a_ctrl_c_that_a_finaliser_discards_ends_the_run_all_the_same():
+    with pytest.raises(KeyboardInterrupt), runner._interruptible() as go_on:
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        go_on()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("{recordings}", "--joints: expected the folder of the joint files"),
+        ("{recordings} --joints nowhere", "there is no nowhere"),
+        ("nothing/*.csv --joints {joints}", "expected at least one recording"),
+        ("{recordings} --joints {recordings}", "expected joint files (*.toml)"),
+        ("{recordings} --joints {joints} --workers 0", "--workers: expected a whole number above 0"),
+        ("{recordings} --joints {joints} --memory much", "--memory: expected a size"),
+        ("{recordings} --joints {joints} --memory 0", "--memory: expected a size"),
+        ("{recordings} --joints {joints} --memory=-1GiB", "--memory: expected a size"),
+        ("{recordings} --joints {joints} --since soon", "--since: expected a date"),
+        ("nosuch://x/*.csv --joints {joints}", "nosuch://x/*.csv: cannot be reached"),
+        ("report", "fleet report: expected one folder"),
+        ("report nowhere", "expected a table of `drivelink fleet`"),
+        ("{recordings} --joints {joints} --scheduler tcp://127.0.0.1:1", "expected tls://HOST:PORT: without TLS anybody who reaches"),
+        ("{recordings} --joints {joints} --scheduler 127.0.0.1:1", "expected tls://HOST:PORT"),
+        ("{recordings} --joints {joints} --scheduler tls://127.0.0.1:1", "expected certificates in Dask's configuration"),
+        ("{recordings} --joints {joints} --scheduler tcp://127.0.0.1:1 --insecure", "--scheduler tcp://127.0.0.1:1: cannot be reached"),
+    ],
+)  # fmt: skip
+def test_what_a_user_gets_wrong_also_of_certificates_is_one_line(
+    fleet, tmp_path, monkeypatch, capsys,
+    arguments, said,
+):  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runner, "_CONNECT_S", 0.5)
+    places = {"recordings": fleet / "recordings", "joints": fleet / "joints"}
+    assert main(["fleet", *arguments.format(**places).split()]) != 0
+    error = capsys.readouterr().err.splitlines()
+    assert said in error[-1]
+    assert len(error) <= 2
+    assert ("anybody who reaches it runs code" in error[0]) == ("--insecure" in arguments)
+
+
+def test_nobody_without_the_certificate_of_the_run_gets_into_the_local_cluster():
+    from distributed import Security
+    from distributed.core import rpc
+
+    async def called(address: str, security: Security | None) -> str:
+        arguments = security.get_connection_args("client") if security else {}
+        try:
+            async with rpc(address, connection_args=arguments, timeout=3) as peer:
+                return str((await peer.identity())["type"])
+        except OSError:
+            return "refused"
+
+    with runner._client(runner.Settings(workers=1), 1) as client:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+        doors = [client.scheduler.address, *workers, *(one["nanny"] for one in workers.values())]
+        assert len(doors) == 3
+        for address in doors:
+            plain = address.replace("tls://", "tcp://")
+            assert asyncio.run(called(address, client.security)) != "refused"
+            assert asyncio.run(called(address, Security.temporary())) == "refused"
+            assert asyncio.run(called(plain, None)) == "refused"
+        (worker,) = workers.values()
+        for port in (worker["services"]["dashboard"], client.scheduler_info()["services"].get("dashboard")):
+            if port is not None:
+                with pytest.raises(HTTPError, match="404"):
+                    urlopen(f"http://127.0.0.1:{port}/info/main/workers.html", timeout=5)
+        assert Path(worker["local_directory"]).parents[1].stat().st_mode & 0o077 == 0

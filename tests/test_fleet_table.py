@@ -1,0 +1,201 @@
+"""The table of a fleet: rows of runs at once and after each other, and what the page makes of them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import fleetkit
+import numpy as np
+import pytest
+
+REASON = "the extra [fleet] is not installed"
+pytest.importorskip("distributed", reason=REASON)
+pq = pytest.importorskip("pyarrow.parquet", reason=REASON)
+
+from drivelink.fleet import table  # noqa: E402
+from drivelink.fleet.page import page  # noqa: E402
+from drivelink.fleet.storage import FleetError, Source, Store  # noqa: E402
+from drivelink.fleet.summary import COLUMNS, summarise  # noqa: E402
+from drivelink.fleet.table import FleetTable, read_rows  # noqa: E402
+
+# Dask's own: a process that was ended on purpose leaves sockets behind.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
+
+# The table
+
+
+def row(digest: str = "a", joint: str | None = "elbow", **more: Any) -> dict[str, Any]:
+    return {
+        "id": f"{digest}-{joint}", "joint": joint, "digest": digest, "recording": f"{digest}.csv", "size_bytes": 1,
+        "stamp": "s", "status": "done", "version": "1", "accepted_model": "m", "transmission": 1,
+        "time": datetime(2026, 1, 1, tzinfo=UTC),
+    } | more  # fmt: skip
+
+
+def append(folder: Path, *rows: dict[str, Any]) -> None:
+    """As a run does it."""
+    with FleetTable(Store(str(folder))) as one:
+        one.append([*rows])
+
+
+def test_rows_of_runs_one_after_the_other_and_at_once_stand_in_one_part(tmp_path):
+    append(tmp_path, row("a"))
+    append(tmp_path, row("b"))
+    assert len(list(tmp_path.glob("table/*.parquet"))) == 1
+    assert not list(tmp_path.glob("table/*.tmp"))
+    store = Store(str(tmp_path))
+    with FleetTable(store) as first, FleetTable(store) as second:
+        first.append([row("c")])
+        second.append([row("d")])
+    assert fleetkit.ids(tmp_path) == [f"{digest}-elbow" for digest in "abcd"]
+
+
+def test_full_parts_follow_each_other_and_a_newer_row_takes_the_place_of_an_old_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(table, "_PART_ROWS", 2)
+    for digest in "abcde":
+        append(tmp_path, row(digest))
+    assert len(list(tmp_path.glob("table/*.parquet"))) == 3
+    append(tmp_path, row("a", version="2"))
+    assert fleetkit.ids(tmp_path) == [f"{digest}-elbow" for digest in "abcde"]
+    assert {r["id"]: r["version"] for r in read_rows(Store(str(tmp_path)))}["a-elbow"] == "2"
+
+
+def test_what_a_kill_between_two_writes_leaves_double_is_read_once_and_mended(tmp_path):
+    append(tmp_path, row("a"))
+    (part,) = tmp_path.glob("table/*.parquet")
+    shutil.copy(part, part.with_name("part-0.parquet"))
+    assert len(read_rows(Store(str(tmp_path)))) == 1
+    append(tmp_path, row("b"))
+    assert fleetkit.ids(tmp_path) == ["a-elbow", "b-elbow"]
+
+
+def test_an_error_gives_way_to_the_result_of_the_same_recording(tmp_path):
+    append(tmp_path, row("unread-1", None, recording="a.csv", status="error", error="no such host"))
+    with FleetTable(Store(str(tmp_path))) as one:
+        assert one.at(Source("a.csv", 1, "s", None)).failed  # type: ignore[union-attr]
+        one.append([row("a")])
+    assert fleetkit.ids(tmp_path) == ["a-elbow"]
+
+
+def test_a_part_that_is_no_parquet_file_is_one_line(tmp_path):
+    (tmp_path / "table").mkdir()
+    (tmp_path / "table" / "part-1.parquet").write_text("garbage")
+    with pytest.raises(FleetError, match=r"part-1.parquet: expected a Parquet file"):
+        read_rows(Store(str(tmp_path)))
+
+
+# The summary
+
+
+def night(joint: str, k: int, stiffness: float, effects: list[str]) -> dict[str, Any]:
+    values = dict.fromkeys([*COLUMNS, "recording", "time"])
+    return values | {
+        "joint": joint, "transmission": 1, "status": "done", "effects": effects, "model": "linear",
+        "verdict": "effect" if effects else "sufficient", "sentence": "said", "excited": True,
+        "parameters": json.dumps({"k_nm_rad": stiffness}), "covariance": [0.01], "deflection_middle_rad": 0.02,
+        "stiffness_middle_nm_rad": stiffness, "stiffness_std_middle_nm_rad": 0.1, "report": f"{joint}{k}.html",
+        "error_before_relative": 0.1, "error_after_relative": 0.02, "viscous_damping_nm_s_rad": 0.8, "recording": f"{joint}-{k}.csv",
+        "time": datetime(2026, 1, 5, tzinfo=UTC) + timedelta(days=k),
+    }  # fmt: skip
+
+
+def test_joints_come_by_urgency_with_what_changed_since_when():
+    rng = np.random.default_rng(8)
+    rows = []
+    for k in range(20):
+        noise = 0.3 * rng.standard_normal(4)
+        rows.append(night("steady", k, 150.0 + noise[0], []))
+        rows.append(night("drifts", k, 150.0 - 0.5 * k + noise[1], []))
+        rows.append(night("steps", k, 150.0 + 4.0 * (k >= 12) + noise[2], []))
+        rows.append(night("rubs", k, 150.0 + noise[3], ["coulomb_friction@motor"] if k >= 9 else []))
+    document = summarise(rows, 0.05)
+    assert json.loads(json.dumps(document)) == document
+    joints = {one["joint"]: one for one in document["joints"]}
+    assert [one["state"] for one in document["joints"]] == ["changing"] * 3 + ["steady"]
+    (drift,) = joints["drifts"]["transmissions"][0]["changes"]
+    assert drift["kind"] == "drift"
+    assert drift["amount_relative"] == pytest.approx(-9.5 / 150.0, abs=4 * drift["amount_std_relative"])
+    (step,) = joints["steps"]["transmissions"][0]["changes"]
+    assert (step["kind"], step["since"][:10]) == ("step", "2026-01-17")
+    (effect,) = joints["rubs"]["effects"]
+    assert (effect["significant"], effect["since"][:10]) == (True, "2026-01-14")
+    assert joints["rubs"]["sentence"] == "New at the motor since 2026-01-14: Coulomb friction."
+
+
+def test_an_unusable_stiffness_is_no_point_of_the_trend_but_a_cross_on_the_chart():
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
+    rows[4] |= {"stiffness_middle_nm_rad": -20.0, "parameters": '{"k_nm_rad": -20.0}'}
+    rows[5]["excited"] = False
+    document = summarise(rows, 0.05)
+    (joint,) = document["joints"]
+    assert len(joint["transmissions"][0]["series"]) == 8 and joint["state"] == "steady"
+    assert [one["reason"] for one in joint["unusable"]] == [
+        "the fitted stiffness is not above zero", "its motion does not reveal the stiffness",
+    ]  # fmt: skip
+    assert page(document).count('class="cross"') == 4  # on the chart, and in the list
+
+
+def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_chart():
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
+    for k in (8, 9):
+        rows[k] |= {"excited": False, "effects": ["torque_offset@motor"], "error_before_relative": 1.34}
+    rows.append(night("elbow", 10, 150.0, []) | {"status": "error", "error": "no frames"})
+    document = summarise(rows, 0.05)
+    (joint,) = document["joints"]
+    assert joint["state"] == "lost"
+    assert joint["sentence"] == "The last 3 recordings show no stiffness, from 2026-01-13 on: no frames."
+    text = page(document)
+    assert "<h1>1 of 1 joint needs a look: 1 lost</h1>" in text
+    assert text.count('class="found"') == 2 and "134 → 2.00 % of the torque" in text
+
+
+# The rest of the service
+
+
+def test_neither_daemon_nor_command_line_imports_what_the_fleet_needs():
+    code = (
+        "import sys, drivelink, drivelink.cli, drivelink.cli.run, drivelink.daemon.service, drivelink.cli.fleet;"
+        "found = {'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas', 'botocore', 'paramiko'} & set(sys.modules);"
+        "sys.exit(', '.join(found) or None)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_examples_of_the_documentation_read_the_table(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("duckdb")
+    text = (Path(__file__).parent.parent / "docs" / "how-to" / "fleet.md").read_text(encoding="utf-8")
+    examples = [block.split("```")[0] for block in text.split("```python\n")[1:]]
+    assert len(examples) == 1
+    with FleetTable(Store(str(tmp_path / "fleet"))) as one:
+        for k in range(3):
+            one.append([row(str(k), excited=True, stiffness_middle_nm_rad=100.0 + k)])
+    monkeypatch.chdir(tmp_path)
+    for example in examples:
+        exec(compile(example, "docs/how-to/fleet.md", "exec"), {})
+    assert "elbow" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "report",
+    ["javascript:alert(1)", "https://evil.example/report.html", "diagnoses/../../x/report.html", "//x"],
+)
+def test_the_table_is_data_on_the_page(report):
+    rows = [night("elbow", k, 150.0, ["coulomb_friction@motor"]) for k in range(8)]
+    good = "diagnoses/elbow/0123456789abcdef01234567-2/report.html"
+    for row in rows:
+        row |= {"report": report, "sentence": "<script>alert(1)</script>"}
+    rows[-1]["report"] = good
+    text = page(summarise(rows, 0.05))
+    assert report not in text and "<script" not in text
+    assert f'href="{good}"' in text
+    assert "Content-Security-Policy" in text and "default-src 'none'" in text

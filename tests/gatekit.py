@@ -44,47 +44,16 @@ class Drawn:
 def draw(kind: str, seed: int, *, effects: bool = True, seconds: float = 8.0, held: bool = False) -> Drawn:
     """The joint of that kind and seed, recorded in a rich motion; with its link held, if asked for."""
     rng = np.random.default_rng((KINDS.index(kind), seed))
-
-    def between(low: float, high: float) -> float:
-        return float(low * (high / low) ** rng.random())
-
-    motors = 2 if kind in ("antagonistic", "serial") else 1
-    inertia = between(0.02, 2.0) if kind == "geared" else between(5e-4, 0.2)
-    stiffness = inertia * (2.0 * math.pi * between(*_NATURAL_HZ[kind])) ** 2
-    damping = 2.0 * between(0.01, 0.1) * math.sqrt(stiffness * inertia)
-    motor = MotorPlant(
-        inertia_kg_m2=inertia, viscous_damping_nm_s_rad=damping, spring=_spring(kind, stiffness, rng)
-    )
-    link_inertia = inertia * between(0.5, 8.0)
-    link = LinkPlant(
-        inertia_kg_m2=link_inertia,
-        viscous_damping_nm_s_rad=0.1 * damping,
-        gravity_nm=stiffness * between(0.01, 0.1) if rng.random() < 0.5 else 0.0,
-    )
-    arrangement = kind if motors == 2 else "single"
-    lever = between(0.3, 1.0) if kind == "serial" else 0.0
-    plant = JointPlant(arrangement=arrangement, motors=(motor,) * motors, link=link, lever_per_rad=lever)
-    torque = typical_torque_nm(plant) * between(0.5, 2.0)
-    gear = {"geared": between(50.0, 160.0), "none": 1.0}.get(kind, between(5.0, 40.0))
-    rated = torque / gear
-    drive = DriveHardware(
-        counts_per_rev=float(rng.choice([4096, 16384, 131072])),
-        gear_ratio=gear,
-        torque_constant_nm_a=0.05,
-        rated_current_a=rated / 0.05,
-        max_current_a=20.0 * rated / 0.05,
-        current_noise_a=rated / 0.05 * between(5e-4, 5e-3),
-    )
-    rig = suitable(plant) | {
-        "amplitude_nm": torque,
-        "seed": seed,
-        "low_hz": 0.2,
-        "high_hz": between(3.0, 10.0),
-    }
-    gain = between(0.3, 3.0)
+    plant, stiffness = _plant(kind, rng)
+    link, motors, damping = plant.link, len(plant.motors), plant.motors[0].viscous_damping_nm_s_rad
+    torque = typical_torque_nm(plant) * _between(rng, 0.5, 2.0)
+    drive = _drive(kind, torque, rng)
+    rig = suitable(plant) | {"amplitude_nm": torque, "seed": seed, "low_hz": 0.2}
+    rig |= {"high_hz": _between(rng, 3.0, 10.0)}
+    gain = _between(rng, 0.3, 3.0)
     rig |= {key: gain * rig[key] for key in ("centring_nm_rad", "centring_nm_s_rad")}
     if held:
-        plant = replace(plant, link=replace(link, inertia_kg_m2=1e6 * link_inertia, gravity_nm=0.0))
+        plant = replace(plant, link=replace(link, inertia_kg_m2=1e6 * link.inertia_kg_m2, gravity_nm=0.0))
     world = World(
         plant,
         (drive,) * motors,
@@ -96,9 +65,10 @@ def draw(kind: str, seed: int, *, effects: bool = True, seconds: float = 8.0, he
         period_s=PERIOD_S,
         seed=seed,
     )
+    gear, beside = drive.gear_ratio, link.inertia_kg_m2 if kind == "none" else 0.0
     declared = tuple(
         Motor(
-            inertia_kg_m2=inertia * float(rng.uniform(0.8, 1.2)) + (link_inertia if kind == "none" else 0.0),
+            inertia_kg_m2=plant.motors[0].inertia_kg_m2 * float(rng.uniform(0.8, 1.2)) + beside,
             viscous_damping_nm_s_rad=damping,
             gear_ratio=gear if gear > 1.0 else None,
             transmission=Transmission(
@@ -107,8 +77,46 @@ def draw(kind: str, seed: int, *, effects: bool = True, seconds: float = 8.0, he
         )
         for i in range(motors)
     )
-    model = JointModel(arrangement=arrangement, motors=declared, period_s=PERIOD_S)
+    model = JointModel(arrangement=plant.arrangement, motors=declared, period_s=PERIOD_S)
     return Drawn(_recorded(record(world, seconds), motors, kind), model, (gear,) * motors)
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(low * (high / low) ** rng.random())
+
+
+def _plant(kind: str, rng: np.random.Generator) -> tuple[JointPlant, float]:
+    """A joint of that kind, and its stiffness in N·m/rad."""
+    motors = 2 if kind in ("antagonistic", "serial") else 1
+    inertia = _between(rng, 0.02, 2.0) if kind == "geared" else _between(rng, 5e-4, 0.2)
+    stiffness = inertia * (2.0 * math.pi * _between(rng, *_NATURAL_HZ[kind])) ** 2
+    damping = 2.0 * _between(rng, 0.01, 0.1) * math.sqrt(stiffness * inertia)
+    motor = MotorPlant(
+        inertia_kg_m2=inertia, viscous_damping_nm_s_rad=damping, spring=_spring(kind, stiffness, rng)
+    )
+    link = LinkPlant(
+        inertia_kg_m2=inertia * _between(rng, 0.5, 8.0),
+        viscous_damping_nm_s_rad=0.1 * damping,
+        gravity_nm=stiffness * _between(rng, 0.01, 0.1) if rng.random() < 0.5 else 0.0,
+    )
+    arrangement = kind if motors == 2 else "single"
+    lever = _between(rng, 0.3, 1.0) if kind == "serial" else 0.0
+    plant = JointPlant(arrangement=arrangement, motors=(motor,) * motors, link=link, lever_per_rad=lever)
+    return plant, stiffness
+
+
+def _drive(kind: str, torque: float, rng: np.random.Generator) -> DriveHardware:
+    """A drive of that torque at the joint."""
+    gear = {"geared": _between(rng, 50.0, 160.0), "none": 1.0}.get(kind, _between(rng, 5.0, 40.0))
+    rated = torque / gear
+    return DriveHardware(
+        counts_per_rev=float(rng.choice([4096, 16384, 131072])),
+        gear_ratio=gear,
+        torque_constant_nm_a=0.05,
+        rated_current_a=rated / 0.05,
+        max_current_a=20.0 * rated / 0.05,
+        current_noise_a=rated / 0.05 * _between(rng, 5e-4, 5e-3),
+    )
 
 
 def _spring(kind: str, stiffness: float, rng: np.random.Generator) -> Spring:

@@ -33,9 +33,10 @@ ROOT = Path(__file__).parent.parent
 PICTURES = ROOT / "docs" / "pictures"
 sys.path.insert(0, str(ROOT / "tests"))
 
-from chromium import Chromium  # noqa: E402
+from chromium import EXECUTABLE, Chromium  # noqa: E402
 
 COLUMNS, LINES = 80, 24
+BEGIN_S = 120.0  # until a program shows what is to be drawn, on any machine
 PAUSE_S = 0.03  # without output: a view that draws ten times a second has drawn it whole
 DRIVELINK = (sys.executable, "-m", "drivelink")
 # rich's own template, without the web fonts it loads from another host.
@@ -62,10 +63,11 @@ def terminal(
     title: str,
     path: Path,
     *,
+    shows: str,
     columns: int = COLUMNS,
     lines: int = LINES,
 ) -> None:
-    """Run a command in a terminal for some seconds, and draw what the terminal then shows."""
+    """Run a command in a terminal, and draw what it shows so many seconds after it shows a word."""
     screen = pyte.Screen(columns, lines)
     stream = pyte.ByteStream(screen)
     master, slave = pty.openpty()
@@ -76,13 +78,15 @@ def terminal(
         command, stdin=slave, stdout=slave, stderr=subprocess.DEVNULL, env=environment, start_new_session=True
     )
     os.close(slave)
-    end = time.monotonic() + seconds
+    begun, end = False, time.monotonic() + BEGIN_S
     while (left := end - time.monotonic()) > 0 or select.select([master], [], [], PAUSE_S)[0]:
         if select.select([master], [], [], max(left, 0.0))[0]:
             try:
                 stream.feed(os.read(master, 65536))
             except OSError:  # it has ended
                 break
+        if not begun and any(shows in row for row in screen.display):
+            begun, end = True, time.monotonic() + seconds
     text = picture(screen)
     process.send_signal(signal.SIGINT)
     while process.poll() is None:
@@ -93,6 +97,8 @@ def terminal(
                 break
     process.wait(timeout=30)
     os.close(master)
+    if not begun:
+        raise SystemExit(f"{title}: expected it to show {shows!r}; is another daemon of this joint running?")
     console = Console(record=True, width=columns, file=io.StringIO(), force_terminal=True)
     console.print(text, end="")
     path.write_text(console.export_svg(title=title, code_format=SVG, unique_id=path.stem), encoding="utf-8")
@@ -148,26 +154,28 @@ def pages(url: str, name: str, below: str, wait_s: float = 1.0) -> None:
 
 def demo(_: Path) -> None:
     """`drivelink demo` in a terminal."""
-    terminal((*DRIVELINK, "demo", "--seconds", "20"), 17.0, "drivelink demo", PICTURES / "demo.svg")
+    command = (*DRIVELINK, "demo", "--seconds", "30")
+    terminal(command, 15.0, "drivelink demo", PICTURES / "demo.svg", shows="observable")
 
 
 def closed(_: Path) -> None:
     """`drivelink demo --case friction` in a terminal, at its end."""
     command = (*DRIVELINK, "demo", "--case", "friction", "--yes")
-    terminal(command, 120.0, "drivelink demo --case friction", PICTURES / "loop.svg", columns=110, lines=64)
+    title = "drivelink demo --case friction"
+    terminal(command, 120.0, title, PICTURES / "loop.svg", shows="stiffness", columns=110, lines=64)
 
 
 def views(_: Path) -> None:
     """`drivelink monitor` in the terminal and in the browser, beside a demo."""
     with (
-        running("demo", "--seconds", "100", "--headless"),
+        running("demo", "--seconds", "300", "--headless"),
         running("monitor", "vsa-ii", "--web", "--port", "0") as web,
     ):
         assert web.stdout is not None
         address = re.search(r"http://\S+", web.stdout.readline())
         assert address is not None
         command = (*DRIVELINK, "monitor", "vsa-ii")
-        terminal(command, 25.0, "drivelink monitor vsa-ii", PICTURES / "monitor.svg")
+        terminal(command, 25.0, "drivelink monitor vsa-ii", PICTURES / "monitor.svg", shows="observable")
         pages(address[0], "web", "section:has(#stiffnessplot)", wait_s=35.0)
 
 
@@ -186,6 +194,8 @@ def main() -> None:
     """Draw all, or those that are named."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=DRAWN, default=list(DRAWN), help="these only")
+    if EXECUTABLE is None:
+        raise SystemExit("docs/pictures.py: expected Chromium on the PATH: apt install chromium")
     PICTURES.mkdir(exist_ok=True)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore Ctrl-C
     with tempfile.TemporaryDirectory() as folder:

@@ -89,6 +89,11 @@ class Chromium:
             mobile=width < 600,
         )
 
+    def prefer(self, *, dark: bool) -> None:
+        """Ask pages for their dark mode, or the light one."""
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self._call("Emulation.setEmulatedMedia", features=[scheme])
+
     def screenshot(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self._call("Page.captureScreenshot")["data"]))
 

@@ -16,6 +16,7 @@ from types import ModuleType
 
 import daemonkit
 import pytest
+from chromium import Chromium
 
 from drivelink import cli, jointfile
 from drivelink.jointfile.columns import UNITS
@@ -173,3 +174,14 @@ def test_the_workflow_and_the_hooks_run_programs_that_are_there():
     hooks = re.findall(r"entry: (.*)", (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))
     run = (ROOT / ".ci" / "run").read_text(encoding="utf-8").replace("check .", "check")
     assert hooks and all(hook.removesuffix(" --force-exclude") in run for hook in hooks)
+
+
+def test_the_script_of_pictures_asks_of_the_browser_what_it_can():
+    """It needs Chromium and minutes: no test runs it."""
+    tree = ast.parse((DOCS / "pictures.py").read_text(encoding="utf-8"))
+    asked = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "browser"
+    }
+    assert asked and asked <= set(dir(Chromium))

@@ -140,6 +140,15 @@ def test_jitter_lost_syncs_and_stalls_are_no_other_period(lost):
         assert measure_period(sorted(stamps)[:64], 0.001)[:2] == (0.001, True)
 
 
+def test_a_jitter_of_a_fifth_of_a_period_and_lost_syncs_are_no_other_period():
+    kept = 0
+    for seed in range(60):
+        rng = random.Random(seed)
+        times = [k + rng.gauss(0.0, 0.2) for k in range(100) if rng.random() >= 0.05][:64]
+        kept += measure_period([round(time * MS) for time in sorted(times)], 0.001).same
+    assert kept >= 57
+
+
 def test_too_few_stamps_decide_nothing():
     assert measure_period([k * MS for k in range(7)], 0.001) is None
     assert measure_period([5] * 100, 0.001) is None

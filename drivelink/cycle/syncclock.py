@@ -17,11 +17,9 @@ MEASURED_SYNCS = 64  # enough for a period to 0.2 % at a jitter of half of it, t
 _FEWEST = 8
 _SAME = 0.01  # relative: periods that count as the same; 2 % of inertia torque
 _STEADY = 0.02  # the same: then stalls are no part of the median
-_NEAR = 0.05  # relative: of the median step, with jitter
-_WIDTH, _MOST = (
-    0.2,
-    0.4,
-)  # share of SYNCs within so much of a period of the declared times; 1 % off: 0.31 of 64
+_CHANCE = (
+    1e-3  # that times without a common phase agree so well with the declared period; 2 % off, 64 have none
+)
 _JITTERY = 0.15  # median deviation of the steps, in periods
 _SIGMAS = 3.0
 
@@ -39,7 +37,7 @@ class MeasuredPeriod(NamedTuple):
 def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPeriod | None:
     """Return the period of SYNCs from their stamps, robust to jitter, stalls and lost SYNCs.
 
-    The expected one where the median step is as long and steady, or where most SYNCs come at its times. Else
+    The expected one where the median step is as long and steady, or where SYNCs agree with its times. Else
     the slope of a line through the stamps over their numbers, rounded to a value within three standard
     deviations.
 
@@ -63,8 +61,7 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
         return None
     spread = float(np.median(np.abs(gaps - period_s))) / period_s
     steady = spread < _STEADY and abs(period_s - expected_s) <= _SAME * expected_s
-    near = abs(period_s - expected_s) <= _NEAR * expected_s
-    if steady or (near and _agreeing(stamps / expected_s) >= _MOST):
+    if steady or (0.5 < period_s / expected_s < 1.5 and _agree(stamps / expected_s)):
         return MeasuredPeriod(expected_s, True, spread <= _JITTERY)
     if spread > _JITTERY:
         # A step of nearly two periods may be jitter; only larger ones count as lost.
@@ -85,11 +82,9 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
     return MeasuredPeriod(found, False, spread <= _JITTERY)
 
 
-def _agreeing(places: FloatArray) -> float:
-    """Largest share of times, in periods, that are the same within a period but for `_WIDTH`."""
-    phases = np.sort(places % 1.0)
-    ends = np.searchsorted(np.concatenate((phases, phases + 1.0)), phases + _WIDTH, side="right")
-    return float(np.max(ends - np.arange(phases.size))) / phases.size
+def _agree(places: FloatArray) -> bool:
+    """Whether times, in periods, have a common phase: Rayleigh's test against any phase at all."""
+    return bool(np.abs(np.mean(np.exp(2j * np.pi * places))) ** 2 * places.size > -math.log(_CHANCE))
 
 
 def _slope(numbers: FloatArray, times_s: FloatArray) -> tuple[float, float]:

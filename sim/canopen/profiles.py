@@ -48,83 +48,32 @@ PROFILES: dict[str, Quirks] = {
     quirks.name: quirks
     for quirks in (
         Quirks(),
-        Quirks(
-            name="epos4",
-            differs=(
-                "no 0x6063, 0x6075, 0x6078, 0x607E, 0x608F, 0x6091, 0x1006, 0x1019, 0x1800:05; current in "
-                "mA at 0x30D1:02; 0x1005 constant; TPDO type 255 with 1 ms inhibit time; whole rpm"
-            ),
-            eds="epos4",
-            current_ma=(0x30D1, 2),
-        ),
-        Quirks(
-            name="elmo",
-            differs="velocity in counts/s without 0x60A9; TPDO1 and TPDO3 on with type 1",
-            eds="elmo",
-            velocity_unit=_COUNTS_PER_S,
-        ),
-        Quirks(
-            name="nanotec",
-            differs=(
-                "0x60E4:01 sensorless, link encoder 0x60E4:02; no 0x6076, 0x6078; eight TPDOs, the first "
-                "four event-driven"
-            ),
-            eds="nanotec",
-            second_encoder=2,
-        ),
-        Quirks(
-            name="copley",
-            differs="no second encoder, no polarity; velocity in 0.1 counts/s without 0x60A9",
-            eds="copley",
-            velocity_unit=_TENTH_COUNTS_PER_S,
-        ),
-        Quirks(
-            name="roboteq",
-            differs="aborts if bit 30 of a COB-ID changes; starts itself; few objects",
-            eds="roboteq",
-            velocity_unit=_RPM,
-            keep_bit_30=True,
-            self_starting=True,
-        ),
-        Quirks(
-            name="synapticon",
-            differs="mapping in pre-operational only; 0.001 to 1 rpm",
-            eds="synapticon",
-            mapping_in_preoperational=True,
-            velocity_exponents=(0, -1, -2, -3),
-        ),
-        Quirks(
-            name="fixed-map",
-            differs="mapping read only: TPDO2 carries statusword, position, torque",
-            eds="fixed-map",
-            fixed_mapping=True,
-        ),
-        Quirks(
-            name="el72x1",
-            differs="statusword bit 10 toggles",
-            identity=_like("EL72x1", 0x7201),
-            toggle_bit_10=True,
-        ),
-        Quirks(
-            name="self-starting",
-            differs="operational after boot-up",
-            identity=_like("self-starting", 0x0F02),
-            self_starting=True,
-        ),
-        Quirks(
-            name="keeps-pdos",
-            differs="*reset communication* keeps the PDOs",
-            identity=_like("PDO-keeping", 0x0F03),
-            keeps_pdos=True,
-        ),
-        Quirks(
-            name="slow-boot",
-            differs="1.5 s from reset to boot-up",
-            identity=_like("slow-boot", 0x0F04),
-            boot_s=1.5,
-        ),
+        Quirks(name="epos4", eds="epos4", current_ma=(0x30D1, 2), differs=
+               "no 0x6063, 0x6075, 0x6078, 0x607E, 0x608F, 0x6091, 0x1006, 0x1019, 0x1800:05; current in "
+               "mA at 0x30D1:02; 0x1005 constant; TPDO type 255 with 1 ms inhibit time; whole rpm"),
+        Quirks(name="elmo", eds="elmo", velocity_unit=_COUNTS_PER_S,
+               differs="velocity in counts/s without 0x60A9; TPDO1 and TPDO3 on with type 1"),
+        Quirks(name="nanotec", eds="nanotec", second_encoder=2, differs=
+               "0x60E4:01 sensorless, link encoder 0x60E4:02; no 0x6076, 0x6078; eight TPDOs, the first "
+               "four event-driven"),
+        Quirks(name="copley", eds="copley", velocity_unit=_TENTH_COUNTS_PER_S,
+               differs="no second encoder, no polarity; velocity in 0.1 counts/s without 0x60A9"),
+        Quirks(name="roboteq", eds="roboteq", velocity_unit=_RPM, keep_bit_30=True, self_starting=True,
+               differs="aborts if bit 30 of a COB-ID changes; starts itself; few objects"),
+        Quirks(name="synapticon", eds="synapticon", mapping_in_preoperational=True,
+               velocity_exponents=(0, -1, -2, -3), differs="mapping in pre-operational only; 0.001 to 1 rpm"),
+        Quirks(name="fixed-map", eds="fixed-map", fixed_mapping=True,
+               differs="mapping read only: TPDO2 carries statusword, position, torque"),
+        Quirks(name="el72x1", identity=_like("EL72x1", 0x7201), toggle_bit_10=True,
+               differs="statusword bit 10 toggles"),
+        Quirks(name="self-starting", identity=_like("self-starting", 0x0F02), self_starting=True,
+               differs="operational after boot-up"),
+        Quirks(name="keeps-pdos", identity=_like("PDO-keeping", 0x0F03), keeps_pdos=True,
+               differs="*reset communication* keeps the PDOs"),
+        Quirks(name="slow-boot", identity=_like("slow-boot", 0x0F04), boot_s=1.5,
+               differs="1.5 s from reset to boot-up"),
     )
-}
+}  # fmt: skip
 """By name, in the order shown to users."""
 
 

@@ -6,7 +6,7 @@ use crate::gram::{
     Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, by_prior, choose, cluster, dot, log_evidence,
     set, solve, unknowns,
 };
-use crate::spring::Projection;
+use crate::spring::{MARGIN, Projection};
 use crate::student::t_95;
 use crate::unknowns::{ACTIVE, CANDIDATES, DRY, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO};
 
@@ -99,6 +99,17 @@ impl Blocks {
         true
     }
 
+    /// Deflections that were counted from elsewhere may have been larger than the law has: it is known over those since.
+    fn fit_projection(&mut self) {
+        let ([low, high], reach) = (self.seen, self.spring.reach());
+        if !self.lost || self.deflection <= reach || high <= low {
+            return;
+        }
+        let (ends, more, zero) = (REACHED * reach, (MARGIN - 1.0) * (high - low), self.spring.zero);
+        let (low, high) = ((low - more).max(-ends - zero), (high + more).min(ends - zero));
+        self.projection = Some(Projection::between(&self.family, self.deflection, low, high));
+    }
+
     /// The unknowns from all blocks.
     pub(super) fn solve(&mut self) {
         let mut total = Gram::default();
@@ -115,6 +126,7 @@ impl Blocks {
         if !self.is_located(&total) {
             return;
         }
+        self.fit_projection();
         let Some(projection) = self.projection.clone() else { return };
         let near = self.priors.deflection_offset * self.deflection + self.resolution;
         let zero = if self.lost { self.deflection } else { near };
@@ -301,5 +313,60 @@ impl Blocks {
         let (alike, wider) = (ALIKE * blocks * missing / own, wider * t_95(freedom).powi(2));
         let entries = chosen.covariance.iter_mut().flatten().zip(by_prior.iter().flatten());
         entries.for_each(|(v, prior)| *v = wider * (*v + alike * (*v - prior)));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::laws::Law;
+    use crate::model::{Motor, Transmission};
+    use crate::settings::Priors;
+
+    #[test]
+    fn a_law_is_known_where_the_joint_is_however_large_a_deflection_has_seemed() {
+        let transmission = Transmission::Elastic {
+            law: Law::VsaII,
+            order: None,
+            parameters: vec![0.5, 1.75],
+            covariance: None,
+        };
+        let motor = Motor {
+            inertia: 5e-4,
+            inertia_std: None,
+            damping: 5e-3,
+            damping_std: None,
+            fit_rms: None,
+            transmission,
+            effects: Vec::new(),
+        };
+        let priors = Priors {
+            motor_inertia: 0.1,
+            viscous_damping: 0.3,
+            viscous_damping_floor: 0.01,
+            coulomb_friction: 0.1,
+            torque_offset: 0.02,
+            deflection_offset: 0.05,
+            encoder_delay: 1.0,
+        };
+        let mut blocks = Blocks::new(&motor, &priors, 1e-3, 100.0, 75, 1.0);
+        let (low, high, size) = (-0.6, 0.15, 1.8); // it ends at 1.2 rad
+        (blocks.deflection, blocks.seen, blocks.spring.zero) = (size, [low, high], 0.05);
+        let off = |blocks: &Blocks| {
+            let curve = blocks.spring.torque(blocks.projection.as_ref().unwrap());
+            let error = |k: i32| {
+                let phi = low + (high - low) * f64::from(k) / 50.0;
+                let terms = blocks.family.at(phi / size, size);
+                let sum: f64 = terms.iter().zip(&curve).map(|(b, a)| b * a).sum();
+                (sum - blocks.spring.law.at(phi + 0.05, &[0.5, 1.75]).0).abs()
+            };
+            (0..=50).map(error).fold(0.0, f64::max)
+        };
+        blocks.projection = Some(Projection::new(&blocks.family, size, f64::INFINITY));
+        assert!(off(&blocks) > 1e-3);
+        blocks.lost = true;
+        blocks.fit_projection();
+        let torque = blocks.spring.law.at(low, &[0.5, 1.75]).0.abs();
+        assert!(off(&blocks) < EXACT * torque, "{} of {torque}", off(&blocks));
     }
 }

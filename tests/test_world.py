@@ -8,6 +8,9 @@ import joints
 import numpy as np
 import pytest
 
+from estimator import JointModel, Motor, Record, Transmission
+from estimator.diagnosis import diagnose
+
 SOURCE = Path(__file__).parent.parent / "benchmarks" / "world.c"
 
 
@@ -100,3 +103,25 @@ def test_every_motion_moves_the_joint_and_pushes_only_where_somebody_pushes(worl
 def test_a_wrong_setting_is_one_line(world, setting, says):
     code, _, error = world(setting)
     assert code == 2 and says in error and error.count("\n") == 1
+
+
+def test_a_hand_that_moves_a_healthy_joint_shows_no_other_inertia(world):
+    """The motor's torque is small: inertia and stiffness scaled down alike leave less, and explain nothing."""
+    settings = (
+        "motion=hand-guided size=8 push=4.42 seed=5121 seconds=20 stiffness=124.45 inertia=0.2483 damping=0.93 "
+        "link_inertia=0.89 link_damping=0.058 gravity=0 link_delay=0.0007 motor_counts=65536 link_bits=18"
+    )
+    _, c, _ = world(*settings.split())
+    record = Record(
+        period_s=1e-3,
+        sequence=np.arange(len(c["time_s"])),
+        motor_position_rad=c["motor1_position_rad"][:, None],
+        motor_torque_nm=c["motor1_torque_nm"][:, None],
+        link_position_rad=c["link_position_rad"],
+    )
+    motor = Motor(
+        inertia_kg_m2=0.2483, viscous_damping_nm_s_rad=0.93, inertia_std_relative=1e-4,
+        transmission=Transmission(model="linear", parameters={"k_nm_rad": 124.45}),
+    )  # fmt: skip
+    found = diagnose(record, JointModel(arrangement="single", motors=(motor,)))
+    assert found.verdict == "sufficient", found.effects

@@ -165,7 +165,8 @@ class Search:
         while True:
             found = self.held.simplest(self.seen)
             if found in tried:
-                return found
+                better = np.mean(self.held.scores(found)) > np.mean(self.held.scores(self.null))
+                return found if better else self.null
             if found in settled:
                 tried.add(found)
                 beside = self._beside(found)

@@ -184,7 +184,7 @@ class Stack:
         made = []
         equations = self._frames[0].equations
         for i in range(len(self._frames[0].motors)):
-            mine = [j for j, s in enumerate(self.slots) if s.motor == i and s.name in _TORQUE_SCALES]
+            mine = [j for j, slot in enumerate(self.slots) if slot.motor == i and self._scales(slot)]
             if not mine:
                 continue
             slopes = np.stack([self._torque_scale(self.slots[j], terms) for j in mine], axis=1)
@@ -193,9 +193,23 @@ class Stack:
             made.append(Scale(groups, np.array(mine), slopes[:1] if same else slopes))
         return tuple(made)
 
+    def _scales(self, slot: Slot) -> bool:
+        """Whether a slot scales a motor's balance.
+
+        An inertia that the file knows the deviation of does where nothing else has a scale: a stiffness
+        follows it.
+        """
+        motor = self._model.motors[slot.motor or 0]
+        known = motor.inertia_std_relative is not None and not self._frames[0].linked
+        alone = known and slot.name == "motor_inertia" and slot.kind == "term"
+        return slot.name in _TORQUE_SCALES or alone
+
     def _torque_scale(self, slot: Slot, terms: Sequence[Term]) -> FloatArray:
         """(m,) relative change of the acting torque per unit of a slot."""
         values = terms[slot.place].values if slot.kind == "term" else {}
+        if slot.name == "motor_inertia":
+            inertia = self._model.motors[slot.motor or 0].inertia_kg_m2
+            return np.full(sum(len(f.motors[0].torque[:: f.rows_step]) for f in self._frames), 1.0 / inertia)
         slope = _TORQUE_SCALES[slot.name]
         return np.concatenate(
             [slope(f.motors[slot.motor or 0], values)[:: f.rows_step] for f in self._frames]

@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import gatekit
 import numpy as np
 import pytest
 from onlinekit import PERIOD_S, declared, motion
@@ -101,3 +102,16 @@ def test_the_services_bits_have_their_reasons(quadratic):
     for bit, name in ((Status.STALE, "stale"), (Status.MODEL_ALARM, "alarm")):
         assert why_not_valid(int(bit), estimator) == (name, REASONS[name])
     assert why_not_valid(int(Status.VALID | Status.GAP), estimator) is None
+
+
+@pytest.mark.parametrize(("factor", "valid"), [(1.0, True), (3.0, False)])
+def test_a_rigid_joint_is_valid_while_its_balance_is_explained(factor, valid):
+    drawn = gatekit.draw("none", 100, effects=False, seconds=6.0)
+    (motor,) = drawn.model.motors
+    wrong = replace(motor, inertia_kg_m2=factor * motor.inertia_kg_m2)
+    estimator = make_estimator(
+        replace(drawn.model, motors=(wrong,)), EstimatorSettings(), drawn.record.period_s
+    )
+    said = [bool(estimator.step(sample).status & Status.VALID) for sample in drawn.record.samples()]
+    assert set(said[len(said) // 2 :]) == {valid}
+    assert (estimator.why() or ("",))[0] == ("" if valid else "unexplained")

@@ -29,6 +29,7 @@ pub mod model_monitor;
 pub mod noise;
 pub mod paper;
 pub mod reasons;
+pub mod rigid;
 pub mod robust;
 pub mod sample;
 pub mod sample_validator;

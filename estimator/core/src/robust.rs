@@ -17,6 +17,7 @@ use crate::laws::Law;
 use crate::model::{Arrangement, Model, Transmission};
 use crate::noise::NoiseMeter;
 use crate::reasons::Why;
+use crate::rigid::RigidBalance;
 use crate::sample::{Estimate, MOTORS, Sample};
 use crate::sample_validator::SampleValidator;
 use crate::settings::{Method, Priors, Settings};
@@ -44,6 +45,7 @@ pub struct Robust {
     corrections: Corrections,
     alignment: Alignment,
     sides: Vec<Side>,
+    rigid: Vec<RigidBalance>, // of a joint whose motors carry nothing that is declared: none deflects, no link
     link: Channel,
     momentum: Option<LinkMomentum>,
     external: Option<External>,
@@ -92,6 +94,9 @@ impl Robust {
                 Side::new(motor, effects, priors, &filters, period_s, looks as f64 * period_s, alarms)
             })
             .collect();
+        let alone = !model.has_deflection() && model.link.is_none();
+        let rigid = if alone { &motors[..] } else { &[] };
+        let rigid = rigid.iter().map(|motor| RigidBalance::new(motor.inertia)).collect();
         Ok(Robust {
             arrangement: model.arrangement,
             motors: model.motors.len(),
@@ -106,6 +111,7 @@ impl Robust {
             corrections,
             alignment: Alignment::default(),
             sides,
+            rigid,
             link: Channel::rest(0.0),
             momentum: LinkMomentum::new(model, settings, priors, period_s),
             external: None,
@@ -138,6 +144,7 @@ impl Robust {
         self.corrections.reset();
         self.alignment = Alignment::default();
         self.sides.iter_mut().for_each(Side::reset);
+        self.rigid.iter_mut().for_each(RigidBalance::reset);
         self.momentum.iter_mut().for_each(LinkMomentum::reset);
         self.noise = [NoiseMeter::default(); MOTORS + 1];
         self.torque_noise = [NoiseMeter::default(); MOTORS];

@@ -15,6 +15,9 @@ impl Robust {
         let settled = self.unsettled <= 0;
         let parts = self.read(0.0);
         self.sides.iter_mut().for_each(Side::act);
+        for ((balance, part), torque) in self.rigid.iter_mut().zip(&parts).zip(self.last.torque) {
+            balance.add(part.flexibility_torque, torque, self.period);
+        }
         let [why, of_torque] = self.reasons(&parts, settled);
         let repeats = self.refused.is_some_and(|(what, _)| what.reason == suspicion::Reason::Frozen);
         let rejected =
@@ -84,7 +87,12 @@ impl Robust {
         let mut found = [None; 2];
         for (i, (side, part)) in self.sides.iter().zip(parts).enumerate() {
             let reasons = side.reasons(part, self.valid_within, settled);
-            for (found, reason) in found.iter_mut().zip(reasons) {
+            let left = self.rigid.get(i).and_then(|balance| {
+                let noise =
+                    [self.torque_noise[i].variance(f64::INFINITY), self.noise_of(i)[0] * self.noise_gains[2]];
+                balance.unexplained(self.valid_within, noise).map(Reason::Unexplained)
+            });
+            for (found, reason) in found.iter_mut().zip(reasons.map(|reason| reason.or(left))) {
                 *found = found.or(reason.map(|reason| Why {
                     reason,
                     motor: Some(i),

@@ -272,7 +272,7 @@ def bits_table(flags: type[Bits]) -> str:
 
 def reasons_table() -> str:
     """One row a reason why an estimate is not valid: its sentence, with placeholders."""
-    words = {"{share:.2g}": "44", "{asked:.2g}": "20", "{changes}": "torque gain or stiffness has"}
+    words = {"{share}": "44", "{asked:.2g}": "20", "{changes}": "torque gain or stiffness has"}
     rows = ["| name | sentence, with example numbers |", "|---|---|"]
     for name, sentence in REASONS.items():
         for placeholder, example in words.items():

@@ -26,11 +26,11 @@ REASONS: dict[str, str] = {
     "rejected": "the samples cannot be used",
     "unmoved": "the motion has not revealed the stiffness yet",
     "open": "the motion leaves the stiffness open",
-    "imprecise": "stiffness known to ± {share:.2g} %, asked for ± {asked:.2g} %",
-    "torque_imprecise": "torque known to ± {share:.2g} % of its rms, asked for ± {asked:.2g} %",
+    "imprecise": "stiffness known to ± {share} %, asked for ± {asked:.2g} %",
+    "torque_imprecise": "torque known to ± {share} % of its rms, asked for ± {asked:.2g} %",
     "not_positive": "the stiffness comes out at or below zero: check signs, torque and inertia",
     "motor": "no motor of the declared inertia and damping fits the motion",
-    "unexplained": "the model leaves {share:.2g} % of the torque balance unexplained",
+    "unexplained": "the model leaves {share} % of the torque balance unexplained",
     "beyond": "the deflection is larger than any that was learned from",
     "changed": "{changes} changed",
     "lost": "the zero between the encoders, or the torque's, is not known: move the joint, or home it",
@@ -64,9 +64,13 @@ def reason_text(
         asked: `valid_within` of the settings.
         changes: keys of `CHANGES` between which the data do not decide; empty: not known yet.
     """
+    # Two digits, or as many as tell it from what is asked for.
+    digits = next((n for n in range(2, 6) if share == asked or f"{share:.{n}g}" != f"{asked:.{n}g}"), 6)
     words = " or ".join(CHANGES[change] for change in changes)
     text = REASONS[name].format(
-        share=100.0 * share, asked=100.0 * asked, changes=f"{words} has" if words else "the joint has"
+        share=f"{100.0 * share:.{digits}g}",
+        asked=100.0 * asked,
+        changes=f"{words} has" if words else "the joint has",
     )
     return f"motor {motor}: {text}" if motor else text
 

@@ -24,6 +24,9 @@ def test_every_reason_and_change_of_the_core_has_its_words():
 
 def test_the_sentences_are_those_of_the_documentation():
     assert reason_text("imprecise", share=0.44, asked=0.2) == "stiffness known to ± 44 %, asked for ± 20 %"
+    assert (
+        reason_text("imprecise", share=0.2004, asked=0.2) == "stiffness known to ± 20.04 %, asked for ± 20 %"
+    )
     text = reason_text("changed", motor=2, changes=["torque_scale", "stiffness"])
     assert text == "motor 2: torque gain or stiffness has changed"
     assert reason_text("changed") == "the joint has changed"

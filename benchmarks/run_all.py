@@ -62,6 +62,7 @@ SECTIONS = {
     "loop": Section(
         "The loop that closes itself, on each effect", quick="--effects coulomb_friction,backlash"
     ),
+    "healthy": Section("Second recordings of healthy joints", quick="--seeds 2"),
     "real_data": Section("Real data before and after"),
     "constants": Section("Choice constants halved and doubled", "--report"),
     "external": Section("External torque and contact", quick="--minutes 2 --errors 2 --joints sea"),

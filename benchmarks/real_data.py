@@ -211,7 +211,7 @@ def rows(args) -> Iterator[scene.Row]:
         stiffness, sensor = None, None
         if parameters:
             known = one["known_nm_rad"]
-            stiffness = f"{parameters['k_nm_rad']:.3g} ± {1.96 * std['k_nm_rad']:.1g} (95 %) / {known:.3g}"
+            stiffness = f"{parameters['k_nm_rad']:.3g} ± {1.96 * std['k_nm_rad']:.2g} (95 %) / {known:.3g}"
         if one["sensor"] is not None:
             form = "{on_line:.1%} ({valid:.0%}), {twist:.1%}, {external:.1%} ({external_valid:.0%})"
             sensor = form.format(**one["sensor"])

@@ -102,3 +102,17 @@ pub struct Priors {
     /// Of the link encoder's delay, periods.
     pub encoder_delay: f64,
 }
+
+#[cfg(test)]
+impl Priors {
+    /// Of the unit tests: about those of `estimator/priors.py`.
+    pub(crate) const USUAL: Priors = Priors {
+        motor_inertia: 0.05,
+        viscous_damping: 0.2,
+        viscous_damping_floor: 0.05,
+        coulomb_friction: 0.1,
+        torque_offset: 0.3,
+        deflection_offset: 0.003,
+        encoder_delay: 1.0,
+    };
+}

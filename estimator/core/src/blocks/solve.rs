@@ -340,16 +340,7 @@ mod tests {
             transmission,
             effects: Vec::new(),
         };
-        let priors = Priors {
-            motor_inertia: 0.1,
-            viscous_damping: 0.3,
-            viscous_damping_floor: 0.01,
-            coulomb_friction: 0.1,
-            torque_offset: 0.02,
-            deflection_offset: 0.05,
-            encoder_delay: 1.0,
-        };
-        let mut blocks = Blocks::new(&motor, &priors, 1e-3, 100.0, 75, 1.0);
+        let mut blocks = Blocks::new(&motor, &Priors::USUAL, 1e-3, 100.0, 75, 1.0);
         let (low, high, size) = (-0.6, 0.15, 1.8); // it ends at 1.2 rad
         (blocks.deflection, blocks.seen, blocks.spring.zero) = (size, [low, high], 0.05);
         let off = |blocks: &Blocks| {

@@ -171,17 +171,8 @@ mod tests {
             link: Some(link),
             link_effects: vec![],
         };
-        let priors = Priors {
-            motor_inertia: 0.05,
-            viscous_damping: 0.2,
-            viscous_damping_floor: 0.05,
-            coulomb_friction: 0.1,
-            torque_offset: 0.3,
-            deflection_offset: 1.0,
-            encoder_delay: 1.0,
-        };
         let settings = Settings { k_tau: 100.0, ..Settings::default() };
-        let mut momentum = PaperMomentum::new(&model, &settings, &priors, 1e-3).unwrap();
+        let mut momentum = PaperMomentum::new(&model, &settings, &Priors::USUAL, 1e-3).unwrap();
         let acceleration = 6.0; // of 3 N·m
         for k in 0..60u32 {
             let t = 1e-3 * f64::from(k);
@@ -202,6 +193,6 @@ mod tests {
             }
         }
         let nothing = Model { link: None, ..model };
-        assert!(PaperMomentum::new(&nothing, &settings, &priors, 1e-3).is_none());
+        assert!(PaperMomentum::new(&nothing, &settings, &Priors::USUAL, 1e-3).is_none());
     }
 }

@@ -34,19 +34,9 @@ const FREE: Link = Link {
     gravity_std: 0.0,
 };
 
-const PRIORS: Priors = Priors {
-    motor_inertia: 0.05,
-    viscous_damping: 0.2,
-    viscous_damping_floor: 0.05,
-    coulomb_friction: 0.1,
-    torque_offset: 0.3,
-    deflection_offset: 0.003,
-    encoder_delay: 1.0,
-};
-
 #[test]
 fn a_load_on_a_link_that_turns_one_way_is_not_taken_for_its_friction() {
-    let mut momentum = LinkMomentum::new(&joint(FREE), &Settings::default(), &PRIORS, T).unwrap();
+    let mut momentum = LinkMomentum::new(&joint(FREE), &Settings::default(), &Priors::USUAL, T).unwrap();
     momentum.reset();
     let (load, speed) = (-1.9, 40.0);
     momentum.restart(0.0, load);
@@ -66,7 +56,7 @@ fn a_load_on_a_link_that_turns_one_way_is_not_taken_for_its_friction() {
 fn a_push_on_a_free_link_rises_as_its_filter_does() {
     // q = ½ (τ/M) t² with τ_e = 0: the residual is w³/(s + w)³ of the push.
     let settings = Settings { contact_torque: Some(0.1), ..Settings::default() };
-    let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &PRIORS, T).unwrap();
+    let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &Priors::USUAL, T).unwrap();
     momentum.reset();
     momentum.restart(0.0, 0.0);
     for _ in 0..200 {
@@ -92,7 +82,7 @@ fn a_push_on_a_free_link_rises_as_its_filter_does() {
 #[test]
 fn an_external_torque_that_is_measured_leaves_no_difference() {
     let settings = Settings::default();
-    let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &PRIORS, T).unwrap();
+    let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &Priors::USUAL, T).unwrap();
     momentum.reset();
     momentum.restart(0.0, 0.0);
     for k in 1..400 {
@@ -110,7 +100,7 @@ fn the_papers_external_residual_obeys_equation_13() {
     // A link held at rest by its transmission against gravity: −r is g through K/(s + K).
     let link = Link { gravity: 6.0, ..FREE };
     let settings = Settings::default();
-    let mut momentum = PaperMomentum::new(&joint(link), &settings, &PRIORS, T).unwrap();
+    let mut momentum = PaperMomentum::new(&joint(link), &settings, &Priors::USUAL, T).unwrap();
     let q: f64 = 0.7;
     let nothing = f64::NAN;
     for k in 0..60u64 {
@@ -136,7 +126,7 @@ fn a_late_sample_is_no_push_and_a_push_beside_it_is_found() {
     // A link that swings freely at 6 rad/s; every 50th sample is 0.3 periods late.
     let contacts = |told: bool, push: f64| {
         let settings = Settings { contact_torque: Some(0.5), ..Settings::default() };
-        let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &PRIORS, T).unwrap();
+        let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &Priors::USUAL, T).unwrap();
         momentum.reset();
         momentum.restart(0.0, 0.0);
         let (speed, begin) = (6.0, 1.0);

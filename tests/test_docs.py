@@ -153,7 +153,8 @@ def test_the_benchmarks_page_lists_every_program():
 def test_examples_are_listed_valid_and_their_cases_those_of_the_package():
     listed = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
     for path in (ROOT / "examples").iterdir():
-        assert path.name == "README.md" or path.name in listed, path.name
+        left = path.name == "__pycache__"  # by a test that ran an example
+        assert left or path.name == "README.md" or path.name in listed, path.name
         if path.suffix == ".toml":
             assert jointfile.load(path).model().motors
     for path in (ROOT / "drivelink" / "joints").glob("*.toml"):

@@ -126,6 +126,7 @@ def test_the_demo_finds_the_stiffness_it_does_not_know(case):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_the_loop_closes_on_what_nobody_declared():
     # Three processes: joint and daemon, black box with its diagnoses, the one that watches and accepts.
     command = [*DEMO, "--case", "friction", "--yes", "--json"]  # all effects: benchmarks/loop.py

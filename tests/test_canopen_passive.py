@@ -1,9 +1,11 @@
 import pytest
 from canopenkit import Slave, Wire, configure, drive_objects, eds_text, joint_text, signals
 
+from drivelink._core import Assembler
 from drivelink.canopen.layout import Signal
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.sdo_sniffer import SdoSniffer
+from drivelink.cycle.following import PassiveFollower
 from drivelink.errors import DriveError
 from drivelink.jointfile import parse
 
@@ -282,3 +284,14 @@ def test_frames_that_are_heard_of_a_node_whose_map_is_unknown_are_named():
     configurator = PassiveConfigurator([parse(joint_text(drive=STATED, bus=PASSIVE))])
     after(configurator, (0x185, bytes(8)), (0x285, bytes(6)))
     assert "it sends 0x185 (8 bytes), 0x285 (6 bytes)" in str(configurator.missing[5])
+
+
+def test_frames_of_a_node_with_a_map_of_its_own_are_used_again_after_its_restart():
+    configurator = owned()
+    assembler = Assembler((configurator.layouts[5],), 1, active=False)
+    follower = PassiveFollower(configurator, {5: assembler}, dict(configurator.layouts))
+    used = []
+    for cob_id, data in ((0x80, b""), (0x2A5, bytes(8)), BOOT, (0x80, b""), (0x2A5, bytes(8)), (0x80, b"")):
+        used.append(assembler.feed(cob_id, data) is not None)
+        follower.feed(cob_id, data, 0.0)
+    assert used == [False, True, False, False, True, False]

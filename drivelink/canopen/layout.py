@@ -194,8 +194,8 @@ class NodeLayout:
     heartbeat_ms: int = 0  # period of the heartbeat the node produces, as read back; 0: none, or not known
     # (vendor, product code, revision, serial number) of 0x1018; 0 where not reported
     identity: tuple[int, int, int, int] = (0, 0, 0, 0)
-    # unit objects with their unsigned values, as read while it was configured
-    reported: tuple[tuple[tuple[int, int], int], ...] = ()
+    # unit objects with their unsigned values, as read while it was configured, or as heard
+    reported: tuple[tuple[tuple[int, int], int], ...] = field(default=(), compare=False)
     notices: tuple[Notice, ...] = ()  # findings of its configuration
 
 

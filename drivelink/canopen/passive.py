@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from drivelink.canopen.eds import load_eds
@@ -60,10 +61,6 @@ class _PassiveNode:
         if is_mapping((index, subindex)):
             return subindex <= _MOST_ENTRIES
         return (index, subindex) in self._units | _COMMUNICATION or (index, subindex) in _STORED
-
-    def is_unit(self, address: Address) -> bool:
-        """Return whether the scale of a signal depends on an object."""
-        return address in self._units
 
     def restart(self) -> None:
         """Handle a boot-up: mapping and parameters are the node's defaults again."""
@@ -124,7 +121,7 @@ class _PassiveNode:
             return self._layout(self._believed_tpdos()), ""
         except DriveError as error:
             if self.adopted is not None and not any(map(is_mapping, self.listener.written)):
-                return self.adopted, ""
+                return replace(self.adopted, reported=self._reported(self.adopted)), ""
             sheet = self._sheet_tpdos()
             if not sheet:
                 raise
@@ -133,6 +130,11 @@ class _PassiveNode:
             except DriveError:
                 raise error from None
             return layout, self.doubt()
+
+    def _reported(self, adopted: NodeLayout | None = None) -> tuple[tuple[Address, int], ...]:
+        """Unit objects with their values, the heard ones first."""
+        heard = {a: value for a, value in self.listener.values.items() if a in self._units}
+        return tuple({**dict(adopted.reported if adopted is not None else ()), **heard}.items())
 
     def doubt(self) -> str:
         """Return one line on a mapping that is not trusted, with the remedy."""
@@ -193,6 +195,7 @@ class _PassiveNode:
             other_tpdos=tuple(layout for layout in layouts if layout not in used),
             heartbeat_ms=self.listener.values.get((0x1017, 0), 0),
             identity=(identity[0], identity[1], identity[2], identity[3]),
+            reported=self._reported(),
             notices=tuple(offered.notices),
         )
 
@@ -308,11 +311,6 @@ class PassiveConfigurator:
         """Return SDO answers for a node that belong to no request heard; they are not used."""
         return self._nodes[node].listener.unasked
 
-    def units(self, node: int) -> dict[Address, int]:
-        """Return the unit objects of a node as heard, with their unsigned values."""
-        one = self._nodes[node]
-        return {address: value for address, value in one.listener.values.items() if one.is_unit(address)}
-
     def adopt(self, layouts: Iterable[NodeLayout]) -> None:
         """Take layouts from another source; later traffic has priority."""
         for layout in layouts:
@@ -379,8 +377,8 @@ class PassiveConfigurator:
             self.doubts.pop(node_id, None)
             if doubt:
                 self.doubts[node_id] = doubt
-            if self.layouts.get(node_id) != layout:
-                self.layouts[node_id] = layout
+            before, self.layouts[node_id] = self.layouts.get(node_id), layout
+            if layout != before:
                 log_notices(logger, layout.notices)
                 ended.append((node_id, layout))
         return ended

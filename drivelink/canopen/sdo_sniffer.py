@@ -45,18 +45,11 @@ class SdoSniffer:
 
     Args:
         interesting: whether to keep the value of an object.
-        read: called with each object of interest that was read, and its bytes.
     """
 
-    def __init__(
-        self,
-        interesting: Callable[[int, int], bool],
-        timeout_s: float,
-        read: Callable[[Address, bytes], None] = lambda _address, _data: None,
-    ) -> None:
+    def __init__(self, interesting: Callable[[int, int], bool], timeout_s: float) -> None:
         self._interesting = interesting
         self._timeout_s = timeout_s
-        self._read = read
         self.values: dict[Address, int] = {}  # confirmed unsigned values by (index, subindex)
         self.written: set[Address] = set()  # those of them that were written, not read
         # objects with two different answers to one request, or a download that was given up
@@ -107,19 +100,20 @@ class SdoSniffer:
         if transfer is not None and transfer.writing and not transfer.ended:
             self._dispute(transfer.address)
 
-    def response(self, data: bytes, now_s: float) -> None:
-        """Take a frame of the node, 0x580 + node."""
+    def response(self, data: bytes, now_s: float) -> tuple[Address, bytes] | None:
+        """Take a frame of the node, 0x580 + node; return the object of interest that it ends to read."""
         transfer = self._transfer
         if len(data) != 8 or self._blocks:
-            return
+            return None
         if transfer is None or now_s - transfer.asked_s > self._timeout_s or not _names(transfer, data):
             self.unasked += 1
         elif transfer.due is None:
             self._repeated(transfer, data)
         elif data[0] >> 5 in (transfer.due, _ABORT):
-            self._accept(transfer, data)
+            return self._accept(transfer, data)
         else:
             self.unasked += 1
+        return None
 
     def _goes_on(self, data: bytes, now_s: float) -> bool:
         """Whether a frame of the master belongs to a block download: its segments look like any request."""
@@ -130,7 +124,7 @@ class SdoSniffer:
         self._last_segment = bool(data[0] & 0x80)
         return True
 
-    def _accept(self, transfer: _Transfer, data: bytes) -> None:
+    def _accept(self, transfer: _Transfer, data: bytes) -> tuple[Address, bytes] | None:
         """Take the answer that is due."""
         command = data[0] >> 5
         transfer.due, transfer.answer = None, data
@@ -142,7 +136,8 @@ class SdoSniffer:
         elif command == _SEGMENT_SENT:
             _add_segment(transfer, data)
         if not transfer.ended and (transfer.last or not transfer.segmented):
-            self._complete(transfer)
+            return self._complete(transfer)
+        return None
 
     def _repeated(self, transfer: _Transfer, data: bytes) -> None:
         """Take a further answer to a request."""
@@ -157,11 +152,11 @@ class SdoSniffer:
             self.disputed.add(address)
             self.changes += 1
 
-    def _complete(self, transfer: _Transfer) -> None:
+    def _complete(self, transfer: _Transfer) -> tuple[Address, bytes] | None:
         transfer.ended = True
         address = transfer.address
         if not self._interesting(*address) or len(transfer.data) > _MAX_BYTES:
-            return
+            return None
         if transfer.writing:
             self.written.add(address)
         value = int.from_bytes(transfer.data, "little")
@@ -169,8 +164,7 @@ class SdoSniffer:
             self.values[address] = value
             self.disputed.discard(address)
             self.changes += 1
-        if not transfer.writing:
-            self._read(address, bytes(transfer.data))
+        return None if transfer.writing else (address, bytes(transfer.data))
 
 
 def is_mapping(address: Address) -> bool:

@@ -27,26 +27,70 @@ Used = Callable[[int, NodeLayout], object]
 
 
 class MapFollower:
-    """Common part of the two followers."""
+    """Uses nodes by the mappings that their configurator knows.
+
+    Another master's come from the traffic and have to be trusted. The daemon's own are used as they were
+    configured; in a log of it, the configurator takes them from the traffic too.
+
+    Args:
+        configurator: knows the mappings.
+        assemblers: of the nodes' joints.
+        layouts: of the nodes, as in use.
+        check: compares what the daemon's nodes say by SDO with what is in use; None: nothing is read back.
+    """
 
     def __init__(
-        self, assemblers: Mapping[int, Assembler], layouts: Mapping[int, NodeLayout], used: Used
+        self,
+        configurator: Configurator | PassiveConfigurator,
+        assemblers: Mapping[int, Assembler],
+        layouts: Mapping[int, NodeLayout],
+        used: Used = lambda _node, _layout: None,
+        check: ObjectCheck | None = None,
     ) -> None:
+        self._known = configurator
         self._assemblers = assemblers
         self._in_use = dict(layouts)
         self._used = used
+        self._check = check
+        self._due: dict[int, int] = {}  # nodes whose layout is to be used, and the SYNC after which
+        self._syncs = 0
         self.refused: dict[int, str] = {}  # by node, why a mapping cannot be used
         for assembler in assemblers.values():
             assembler.supervise()
+        if check is not None:
+            for node, layout in layouts.items():
+                check.watch(layout, assemblers[node])
 
     @property
     def doubts(self) -> dict[int, str]:
         """Nodes whose frames are not used, and why."""
-        return {}
+        return self.refused
 
-    def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
-        """Take a frame, in bus order; `now_s` as for `PassiveConfigurator.feed`."""
-        raise NotImplementedError
+    def feed(self, cob_id: int, data: bytes, now_s: float, ahead: int = 0) -> None:
+        """Take a frame, in bus order.
+
+        Args:
+            now_s: time by any clock, for the SDO time-out.
+            ahead: SYNCs that were sent before the frame, and come here after it.
+        """
+        if cob_id == SYNC_COB_ID:
+            self.sync()
+        elif cob_id == 0:
+            if len(data) == 2 and data[0] == _START and data[1] in self._in_use:
+                self._due[data[1]] = self._syncs + ahead
+        elif cob_id > 0x700 and data == _BOOT_UP:
+            self._due.pop(cob_id - 0x700, None)
+        elif 0x580 < cob_id < 0x600:
+            if self._check is not None:
+                self._check.response(cob_id - 0x580, data, now_s)
+            self._known.feed(cob_id, data, now_s)
+        elif 0x600 < cob_id < 0x680:
+            self._known.feed(cob_id, data, now_s)
+            if self._check is not None:
+                self._check.request(cob_id - 0x600, data, now_s)
+            address, assembler = written_object(data), self._assemblers.get(cob_id - 0x600)
+            if address is not None and is_mapping(address) and assembler is not None:
+                assembler.distrust(cob_id - 0x600)
 
     def sync(self) -> Sequence[Mismatch]:
         """Take a SYNC, after the assemblers: new mappings apply from here on.
@@ -54,28 +98,37 @@ class MapFollower:
         Returns:
             What nodes have said by SDO that contradicts what is in use.
         """
-        raise NotImplementedError
+        self._syncs += 1
+        found = self._check.sync() if self._check is not None else ()
+        for node in [node for node, before in self._due.items() if before < self._syncs]:
+            del self._due[node]
+            self._use(node)
+        return found
 
-    def _use(self, node: int, layout: NodeLayout) -> bool:
-        """Read a node's frames by a layout; return whether that is possible."""
-        before = self._in_use[node]
-        if layout.tpdos != before.tpdos:
+    def _use(self, node: int) -> None:
+        """Read a node's frames by its layout, if that is possible."""
+        if isinstance(self._known, PassiveConfigurator):
+            self._known.poll(0.0)
+        layout, assembler = self._known.layouts[node], self._assemblers[node]
+        if layout.tpdos != self._in_use[node].tpdos:
             try:
-                self._assemblers[node].relayout(layout)
+                assembler.relayout(layout)
             except DriveError as error:
                 self.refused[node] = str(error)
-                return False
+                return
         self._in_use[node] = layout
         self.refused.pop(node, None)
-        return True
+        self._used(node, layout)
+        if self._check is not None:
+            self._check.watch(layout, assembler)
+        self._trust(node)
+
+    def _trust(self, node: int) -> None:
+        self._assemblers[node].trust(node)
 
 
 class PassiveFollower(MapFollower):
-    """Keeps the assemblers of passive joints to trusted mappings.
-
-    Args:
-        configurator: takes the mappings from the traffic; starts with the layouts given here.
-    """
+    """Uses the nodes of another master, while their mappings are trusted."""
 
     def __init__(
         self,
@@ -84,10 +137,8 @@ class PassiveFollower(MapFollower):
         layouts: Mapping[int, NodeLayout],
         used: Used = lambda _node, _layout: None,
     ) -> None:
-        super().__init__(assemblers, layouts, used)
-        self._configurator = configurator
-        self._trusted = dict.fromkeys(layouts, True)
-        self._due: set[int] = set()
+        super().__init__(configurator, assemblers, layouts, used)
+        self._listener = configurator
         self._silent = max(2 * _LOOKS, round(_SILENT_S / configurator.bus.period_s))  # SYNCs
         self._heard = dict.fromkeys(assemblers, (0, 0))  # frames of a node, and the SYNC of the last one
         self._speaking: set[int] = set()  # since the last look, other than by PDOs
@@ -99,43 +150,37 @@ class PassiveFollower(MapFollower):
     @property
     def doubts(self) -> dict[int, str]:
         """Nodes whose frames are not used, and why."""
-        return {**self._configurator.doubts, **self.refused}
+        return {**self._listener.doubts, **self.refused}
 
-    def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
+    def feed(self, cob_id: int, data: bytes, now_s: float, ahead: int = 0) -> None:
         """See `MapFollower.feed`."""
         if cob_id == SYNC_COB_ID:
             self.sync()
             return
         if cob_id > 0x700 or 0x580 < cob_id < 0x600:
             self._speaking.add(cob_id & 0x7F)
-        self._configurator.feed(cob_id, data, now_s)
-        self._configurator.poll(now_s)
+        self._listener.feed(cob_id, data, now_s)
+        self._listener.poll(now_s)
         self._judge()
 
     def sync(self) -> Sequence[Mismatch]:
         """See `MapFollower.sync`."""
         self._check_silence()
-        for node in self._due:
-            layout, before = self._configurator.layouts[node], self._in_use[node]
-            if not self._use(node, layout):
-                continue
-            if layout != before:
-                self._used(node, layout)
-            if not self._trusted[node]:
-                self._trusted[node] = True
-                self._assemblers[node].trust(node)
-        self._due.clear()
-        return ()
-
-    def unasked(self, node: int) -> int:
-        """Return SDO answers for a node that belong to no request heard."""
-        return self._configurator.unasked(node)
+        return super().sync()
 
     def lose_sight(self, nodes: Iterable[int] | None = None, why: str = "the bus was lost") -> None:
         """Handle a time in which nodes (None: all) may have restarted unheard."""
-        self._configurator.lose_sight(nodes, why)
-        self._configurator.poll(0.0)
+        self._listener.lose_sight(nodes, why)
+        self._listener.poll(0.0)
         self._judge()
+
+    def unasked(self, node: int) -> int:
+        """Return SDO answers for a node that belong to no request heard."""
+        return self._listener.unasked(node)
+
+    def _trust(self, node: int) -> None:
+        if node in self._assemblers[node].untrusted:
+            super()._trust(node)
 
     def _check_silence(self) -> None:
         """Doubt the nodes that were not heard for a while; every so many SYNCs, or after a gap."""
@@ -159,91 +204,23 @@ class PassiveFollower(MapFollower):
             self.lose_sight(silent, f"no frame of it was heard for {_SILENT_S:g} s")
 
     def _judge(self) -> None:
-        believed = self._configurator.believed
+        believed = self._listener.believed
         for node, assembler in self._assemblers.items():
+            layout, before = self._listener.layouts[node], self._in_use[node]
             if node not in believed:
-                self._due.discard(node)
-                self._trusted[node] = False
+                self._due.pop(node, None)
                 assembler.distrust(node)
-            elif not self._trusted[node] or self._configurator.layouts[node] != self._in_use[node]:
-                if self._configurator.layouts[node].tpdos != self._in_use[node].tpdos:
-                    self._trusted[node] = False
+            elif layout != before or node in assembler.untrusted:
+                if layout.tpdos != before.tpdos:
                     assembler.distrust(node)
                 self.refused.pop(node, None)
-                self._due.add(node)
+                self._due[node] = 0
 
 
 def _slowest(layout: NodeLayout) -> float:
     """SYNCs between two frames of a node; infinite: it sends on events only."""
     every = [tpdo.transmission_type for tpdo in layout.tpdos if 1 <= tpdo.transmission_type <= 240]
     return min(every, default=math.inf)
-
-
-class OwnFollower(MapFollower):
-    """Uses the nodes as the daemon has configured them.
-
-    Args:
-        configurator: the daemon's, or in a log one that takes the mappings from the traffic.
-        check: compares what the nodes say by SDO with what is in use; None: nothing was read back.
-    """
-
-    def __init__(
-        self,
-        configurator: Configurator | PassiveConfigurator,
-        assemblers: Mapping[int, Assembler],
-        layouts: Mapping[int, NodeLayout],
-        used: Used,
-        check: ObjectCheck | None,
-    ) -> None:
-        super().__init__(assemblers, layouts, used)
-        self._configurator = configurator
-        self._check = check
-        self._syncs = 0
-        self._started: dict[int, int] = {}  # nodes, and the SYNC before their start
-
-    def feed(self, cob_id: int, data: bytes, now_s: float, ahead: int = 0) -> None:
-        """See `MapFollower.feed`.
-
-        Args:
-            now_s: time by any clock, for the SDO time-out.
-            ahead: SYNCs that were sent before the frame, and come here after it.
-        """
-        if cob_id == SYNC_COB_ID:
-            self.sync()
-        elif cob_id == 0:
-            if len(data) == 2 and data[0] == _START and data[1] in self._in_use:
-                self._started[data[1]] = self._syncs + ahead
-        elif cob_id > 0x700 and data == _BOOT_UP:
-            self._started.pop(cob_id - 0x700, None)
-        elif 0x580 < cob_id < 0x600:
-            if self._check is not None:
-                self._check.response(cob_id - 0x580, data, now_s)
-            self._configurator.feed(cob_id, data, now_s)
-        elif 0x600 < cob_id < 0x680:
-            self._configurator.feed(cob_id, data, now_s)
-            if self._check is not None:
-                self._check.request(cob_id - 0x600, data, now_s)
-            address, assembler = written_object(data), self._assemblers.get(cob_id - 0x600)
-            if address is not None and is_mapping(address) and assembler is not None:
-                assembler.distrust(cob_id - 0x600)
-
-    def sync(self) -> Sequence[Mismatch]:
-        """See `MapFollower.sync`."""
-        self._syncs += 1
-        found = self._check.sync() if self._check is not None else ()
-        for node in [node for node, before in self._started.items() if before < self._syncs]:
-            del self._started[node]
-            self._begin(node)
-        return found
-
-    def _begin(self, node: int) -> None:
-        """Use a node that was started as it has been configured."""
-        if isinstance(self._configurator, PassiveConfigurator):
-            self._configurator.poll(0.0)
-        layout = self._configurator.layouts[node]
-        if self._use(node, layout):
-            self._used(node, layout)
-            self._assemblers[node].trust(node)
 
 
 def follow_log(configurator: PassiveConfigurator, assembler: Assembler, recent: RecentSamples) -> MapFollower:
@@ -256,13 +233,6 @@ def follow_log(configurator: PassiveConfigurator, assembler: Assembler, recent: 
     assemblers = dict.fromkeys(layouts, assembler)
     if not section.configure:
         return PassiveFollower(configurator, assemblers, layouts)
-    check = ObjectCheck(section.sdo_timeout_s) if section.read_back_s else None
-
-    def watch(node: int, layout: NodeLayout) -> None:
-        if check is not None:
-            units = dict(layout.reported) | configurator.units(node)
-            check.watch(layout, units, assembler, recent.after)
-
-    for node, layout in layouts.items():
-        watch(node, layout)
-    return OwnFollower(configurator, assemblers, layouts, watch, check)
+    samples = dict.fromkeys(layouts, recent.after)
+    check = ObjectCheck(section.sdo_timeout_s, samples) if section.read_back_s else None
+    return MapFollower(configurator, assemblers, layouts, check=check)

@@ -9,16 +9,14 @@ of the right length may carry another object than its map says.
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import islice
 from typing import Any
 
-from drivelink._core import Assembler, JointPipeline
+from drivelink._core import Assembler
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal
 from drivelink.canopen.sdo import Session
 from drivelink.canopen.sdo_sniffer import SdoSniffer
@@ -54,6 +52,23 @@ class _Answer:
     answered: int
 
 
+@dataclass(slots=True, eq=False)
+class _Object:
+    """One object of a node, and what it should say: as a unit its value, else what the frames carry."""
+
+    node: int
+    address: Address
+    unit: int = 0  # its value when the node was configured
+    mapped: tuple[MappedObject, Pick] | None = None  # where a sample has it; None: it is a unit
+    doubts: int = 0  # answers in a row that contradict
+    asked_s: float = -math.inf  # when it was asked for last
+
+    @property
+    def signal(self) -> Signal | None:
+        """What its value means; None: it is a unit."""
+        return self.mapped[0].signal if self.mapped is not None else None
+
+
 @dataclass(slots=True)
 class _Node:
     """One node."""
@@ -62,12 +77,10 @@ class _Node:
     samples: Samples
     motor: int  # from 1 on (0: the link's)
     since: int  # the SYNC since which its frames are read as now
-    units: Mapping[Address, int]  # as configured
-    values: Mapping[Address, tuple[MappedObject, Pick]]  # mapped objects, and where a sample has them
+    objects: Mapping[Address, _Object]  # values, then units
     sniffer: SdoSniffer
     asked: int = -1  # the SYNC before the present request
     answers: deque[_Answer] = field(default_factory=deque)  # not judged yet
-    doubts: Counter[Address] = field(default_factory=Counter)  # answers in a row that contradict
     found: Mismatch | None = None  # the value that is contradicted
 
 
@@ -87,41 +100,52 @@ class RecentSamples:
 
 
 class ObjectCheck:
-    """The objects of all nodes of one bus."""
+    """The objects of all nodes of one bus.
 
-    def __init__(self, timeout_s: float) -> None:
+    Args:
+        timeout_s: of an SDO transfer.
+        samples: by node, its joint's samples after a SYNC, at most so many.
+    """
+
+    def __init__(self, timeout_s: float, samples: Mapping[int, Samples]) -> None:
         self._timeout_s = timeout_s
+        self._samples = samples
         self._nodes: dict[int, _Node] = {}
 
-    def watch(
-        self, layout: NodeLayout, units: Mapping[Address, int], assembler: Assembler, samples: Samples
-    ) -> None:
-        """Begin with a node that has been configured.
-
-        Args:
-            samples: the joint's samples after a SYNC, at most so many.
-        """
+    def watch(self, layout: NodeLayout, assembler: Assembler) -> None:
+        """Begin with a node that has been configured."""
         node_id, before = layout.node_id, self._nodes.get(layout.node_id)
+        objects = _objects(layout)
         node = self._nodes[node_id] = _Node(
             assembler=assembler,
-            samples=samples,
+            samples=self._samples[node_id],
             motor=0 if layout.motor is None else layout.motor + 1,
             since=assembler.sequence,
-            units=units,
-            values=_values(layout),
-            sniffer=SdoSniffer(
-                partial(self._watched, node_id), self._timeout_s, partial(self._take, node_id)
-            ),
+            objects=objects,
+            sniffer=SdoSniffer(lambda *address: address in objects, self._timeout_s),
         )
         if before is not None and before.found is not None:
-            if before.found.signal in {mapped.signal for mapped, _ in node.values.values()}:
+            if before.found.signal in {one.signal for one in objects.values()}:
                 node.found = before.found
             else:
                 assembler.contradict(node_id, False)
 
-    def objects(self, node: int) -> list[Address]:
-        """Return what can be asked of a node: values, then units."""
-        return [*self._nodes[node].values, *self._nodes[node].units]
+    @property
+    def objects(self) -> list[_Object]:
+        """What can be asked for."""
+        return [one for node in self._nodes.values() for one in node.objects.values()]
+
+    def watches(self, one: _Object) -> bool:
+        """Return whether its node was not configured again since."""
+        return self._nodes[one.node].objects.get(one.address) is one
+
+    def used(self, node: int) -> bool:
+        """Return whether the frames of a node are used."""
+        return node not in self._nodes[node].assembler.untrusted
+
+    def undecided(self, one: _Object) -> bool:
+        """Return whether an answer waits for the cycles that it is compared with."""
+        return any(answer.address == one.address for answer in self._nodes[one.node].answers)
 
     def request(self, node: int, data: bytes, now_s: float) -> None:
         """Take an SDO frame of a master."""
@@ -129,18 +153,11 @@ class ObjectCheck:
             self._nodes[node].asked = self._nodes[node].assembler.sequence
             self._nodes[node].sniffer.request(data, now_s)
 
-    def response(self, node: int, data: bytes, now_s: float) -> None:
+    def response(self, node_id: int, data: bytes, now_s: float) -> None:
         """Take an SDO frame of a node."""
-        if node in self._nodes:
-            self._nodes[node].sniffer.response(data, now_s)
-
-    def undecided(self, node: int, address: Address) -> bool:
-        """Return whether an answer waits for the cycles that it is compared with."""
-        return any(answer.address == address for answer in self._nodes[node].answers)
-
-    def doubts(self, node: int, address: Address) -> int:
-        """Count answers in a row that contradict what is in use."""
-        return self._nodes[node].doubts[address]
+        node = self._nodes.get(node_id)
+        if node is not None and (read := node.sniffer.response(data, now_s)) is not None:
+            node.answers.append(_Answer(*read, node.asked, node.assembler.sequence))
 
     def sync(self) -> list[Mismatch]:
         """Take a SYNC, after the assemblers; return what has become sure.
@@ -149,75 +166,69 @@ class ObjectCheck:
         """
         found = []
         for node_id, node in self._nodes.items():
-            while node.answers and _due(node, node.answers[0]):
-                answer = node.answers.popleft()
-                mismatch = self._judge(node_id, node, answer)
+            while node.answers and node.assembler.sequence > node.answers[0].answered + _AROUND:
+                mismatch = _judge(node, node.answers.popleft())
                 if mismatch is not None:
                     node.assembler.distrust(node_id)
                     found.append(mismatch)
         return found
 
-    def contradiction(self, assembler: Assembler) -> tuple[int, Mismatch] | None:
-        """Return a motor (0: the link) of a joint whose frames carry something else than it
-        says, and what.
+    def contradiction(self, assembler: Assembler) -> dict[str, Any] | None:
+        """Return what frames of a joint carry else than its nodes say, as `jointwatch.contradiction`
+        gives it; None: nothing.
         """
         for node in self._nodes.values():
             if node.assembler is assembler and node.found is not None:
-                return node.motor, node.found
+                return {
+                    "signal": str(node.found.signal),
+                    "motor": node.motor,
+                    "reason": "contradicted",
+                    "amount": None,
+                    "std": None,
+                    "explains": True,
+                    "text": node.found.text,
+                }
         return None
 
-    def _watched(self, node: int, index: int, subindex: int) -> bool:
-        return (index, subindex) in self._nodes[node].values or (index, subindex) in self._nodes[node].units
 
-    def _take(self, node_id: int, address: Address, data: bytes) -> None:
-        node = self._nodes[node_id]
-        node.answers.append(_Answer(address, data, node.asked, node.assembler.sequence))
-
-    def _judge(self, node_id: int, node: _Node, answer: _Answer) -> Mismatch | None:
-        address = answer.address
-        value = node.values.get(address)
-        signal = value[0].signal if value is not None else None
-        text: str | None
-        if address in node.sniffer.disputed:
-            text = f"{_name(address)} has two different answers: does another device answer for it?"
-        elif value is not None:
-            text = _value_text(node, value, answer)
-        else:
-            text = _unit_text(node.units[address], answer)
-        if text is None:
-            return None
-        if not text:
-            del node.doubts[address]
-            if value is not None and node.found is not None and node.found.signal is signal:
-                node.found = None
-                node.assembler.contradict(node_id, False)
-            return None
-        node.doubts[address] += 1
-        if node.doubts[address] != _SURE or node.found is not None:
-            return None
-        mismatch = Mismatch(node_id, f"node {node_id}: {text}", signal)
-        if value is not None:
-            node.found = mismatch
-            node.assembler.contradict(node_id, True)
-        return mismatch
+def _judge(node: _Node, answer: _Answer) -> Mismatch | None:
+    one = node.objects[answer.address]
+    text: str | None
+    if one.address in node.sniffer.disputed:
+        text = f"{_name(one)} has two different answers: does another device answer for it?"
+    else:
+        text = _unit_text(one, answer) if one.mapped is None else _value_text(node, one, *one.mapped, answer)
+    if text is None:
+        return None
+    if not text:
+        one.doubts = 0
+        if node.found is not None and node.found.signal is one.signal:
+            node.found = None
+            node.assembler.contradict(one.node, False)
+        return None
+    one.doubts += 1
+    if one.doubts != _SURE or node.found is not None:
+        return None
+    mismatch = Mismatch(one.node, f"node {one.node}: {text}", one.signal)
+    if one.mapped is not None:
+        node.found = mismatch
+        node.assembler.contradict(one.node, True)
+    return mismatch
 
 
-def _due(node: _Node, answer: _Answer) -> bool:
-    return node.assembler.sequence > answer.answered + _AROUND
-
-
-def _unit_text(configured: int, answer: _Answer) -> str:
+def _unit_text(one: _Object, answer: _Answer) -> str:
     """What an answer contradicts; empty: nothing."""
     number = int.from_bytes(answer.data, "little")
-    if number == configured:
-        return ""
-    return f"{_name(answer.address)} was {configured} when it was configured, it is {number} now"
+    return (
+        ""
+        if number == one.unit
+        else f"{_name(one)} was {one.unit} when it was configured, it is {number} now"
+    )
 
 
-def _value_text(node: _Node, value: tuple[MappedObject, Pick], answer: _Answer) -> str | None:
+def _value_text(node: _Node, one: _Object, mapped: MappedObject, pick: Pick, answer: _Answer) -> str | None:
     """What an answer contradicts; empty: nothing; None: there is too little to be compared."""
-    (mapped, pick), data = value, answer.data
-    size, before = (mapped.bits + 7) // 8, max(answer.asked - _AROUND - 1, node.since)
+    data, size, before = answer.data, (mapped.bits + 7) // 8, max(answer.asked - _AROUND - 1, node.since)
     samples = node.samples(before, answer.answered + _AROUND - before)
     places = [(pick(sample) + mapped.offset) / mapped.scale for sample in samples]
     places = [place for place in places if math.isfinite(place)]
@@ -230,24 +241,26 @@ def _value_text(node: _Node, value: tuple[MappedObject, Pick], answer: _Answer) 
         off = math.remainder(off, mapped.modulus or 2**mapped.bits)
     if abs(off) <= 1.5 * (high - low) + _ROUNDING:
         return ""
-    return f"its frames carry {low:.0f} to {high:.0f} as {_name(answer.address)}, by SDO it is {count}"
+    return f"its frames carry {low:.0f} to {high:.0f} as {_name(one)}, by SDO it is {count}"
 
 
-def _name(address: Address) -> str:
-    return f"0x{address[0]:04X}:{address[1]:02X}"
+def _name(one: _Object) -> str:
+    return f"0x{one.address[0]:04X}:{one.address[1]:02X}"
 
 
-def _values(layout: NodeLayout) -> dict[Address, tuple[MappedObject, Pick]]:
-    """What a sample has of a node's frames."""
-    motor = layout.motor or 0
+def _objects(layout: NodeLayout) -> dict[Address, _Object]:
+    """What a sample has of a node's frames, and the units that it was configured by."""
+    motor, node = layout.motor or 0, layout.node_id
     picks: dict[Signal, Pick] = {
         Signal.MOTOR_POSITION: lambda sample: sample.motor_position_rad[motor],
         Signal.MOTOR_TORQUE: lambda sample: sample.motor_torque_nm[motor],
         Signal.MOTOR_VELOCITY: lambda sample: sample.motor_velocity_rad_s[motor],
         Signal.LINK_POSITION: lambda sample: sample.link_position_rad,
     }
-    mapped = [mapped for tpdo in layout.tpdos for mapped in tpdo.objects if mapped.signal in picks]
-    return {one.address: (one, picks[one.signal]) for one in mapped}
+    carried = [mapped for tpdo in layout.tpdos for mapped in tpdo.objects if mapped.signal in picks]
+    values = {one.address: _Object(node, one.address, mapped=(one, picks[one.signal])) for one in carried}
+    units = {address: _Object(node, address, unit) for address, unit in layout.reported}
+    return values | {address: one for address, one in units.items() if address not in values}
 
 
 Ask = Callable[[int, Address], Session[bytes]]
@@ -257,111 +270,79 @@ _CLOSELY = 3  # questions for one doubted object that follow each other so
 _FOREIGN_S = 10.0  # of silence after an answer to somebody else's request
 
 
-@dataclass(frozen=True, slots=True)
-class _Question:
-    """One object of a node."""
-
-    node: int
-    address: Address
-    is_unit: bool
-
-
 class ReadBack:
-    """The questions to all nodes of one bus, in turn."""
+    """Asks all nodes of one bus for their objects: new ones first, then values and units by turns."""
 
     def __init__(self, ask: Ask, period_s: float, check: ObjectCheck) -> None:
         self._ask = ask
         self._period_s = period_s
-        self.check = check
-        self._assemblers: dict[int, Assembler] = {}
-        self._first: deque[_Question] = deque()  # new, or in doubt: not by turns
-        self._values: deque[_Question] = deque()
-        self._units: deque[_Question] = deque()
-        self._turns = itertools.cycle((self._values, self._units))
-        self._pending: tuple[_Question, Session[bytes]] | None = None
-        self._asked = 0  # questions for the present object
+        self._check = check
+        self._question: _Object | None = None  # until it is confirmed
+        self._session: Session[bytes] | None = None  # the question under way
+        self._asked = 0  # times, for the present object
+        self._unit = False  # whose turn it is
         self._due_s = self._quiet_s = 0.0
 
-    def watch(self, layout: NodeLayout, pipeline: JointPipeline) -> None:
-        """A node has been configured: ask it first."""
-        node, units = layout.node_id, dict(layout.reported)
-        self._forget(node)
-        self._assemblers[node] = pipeline.assembler
-        self.check.watch(layout, units, pipeline.assembler, pipeline.history.after)
-        objects = self.check.objects(node)
-        self._first.extend(_Question(node, address, address in units) for address in objects)
+    def quiet(self, now_s: float) -> None:
+        """Ask nothing for a while: somebody else talks to a node."""
+        self._quiet_s = now_s + _FOREIGN_S
 
-    def _forget(self, node: int) -> None:
-        for questions in (self._first, self._values, self._units):
-            kept = [question for question in questions if question.node != node]
-            questions.clear()
-            questions.extend(kept)
-        if self._pending is not None and self._pending[0].node == node:
-            self._pending = None
-        self._asked = 0
-
-    def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
-        """Take an SDO frame of a node, or of somebody else who asks it."""
-        if self._pending is None or self._pending[1].done or cob_id != 0x580 + self._pending[0].node:
-            self._quiet_s = now_s + _FOREIGN_S
-            return
-        self._pending[1].feed(cob_id, data, now_s)
+    def feed(self, node: int, data: bytes, now_s: float) -> None:
+        """Take an SDO frame of a node."""
+        question, session = self._question, self._session
+        if session is None or session.done or question is None or question.node != node:
+            self.quiet(now_s)
+        else:
+            session.feed(0x580 + node, data, now_s)
 
     def step(self, now_s: float) -> None:
         """Let time pass."""
-        if self._pending is None:
+        if self._question is not None and not self._check.watches(self._question):
+            self._question = self._session = None
+        question, session = self._question, self._session
+        if question is None or session is None:
             if now_s >= max(self._due_s, self._quiet_s):
                 self._begin(now_s)
             return
-        question, session = self._pending
-        if not session.poll(now_s) or self.check.undecided(question.node, question.address):
+        if not session.poll(now_s) or self._check.undecided(question):
             return
+        self._session = None
         try:
             answered = bool(session.result)
         except DriveError:  # it is busy, or has no such object any more: that says nothing
             answered = False
-        if not answered or not self.check.doubts(question.node, question.address):
-            self._move_on(question, now_s)
-            return
-        self._pending = None
-        self._due_s = now_s + (_FIRST_S if self._asked < _CLOSELY else self._period_s)
-
-    def contradiction(self, assembler: Assembler) -> dict[str, Any] | None:
-        """Return what is contradicted of one joint, as `jointwatch.contradiction` gives it;
-        None: nothing.
-        """
-        contradicted = self.check.contradiction(assembler)
-        if contradicted is None:
-            return None
-        motor, found = contradicted
-        return {
-            "signal": str(found.signal),
-            "motor": motor,
-            "reason": "contradicted",
-            "amount": None,
-            "std": None,
-            "explains": True,
-            "text": found.text,
-        }
+        if answered and question.doubts:
+            self._due_s = now_s + (_FIRST_S if self._asked < _CLOSELY else self._period_s)
+        else:
+            self._move_on(now_s)
 
     def _begin(self, now_s: float) -> None:
-        if not self._first:
-            turn = next(self._turns)
-            if not turn:
-                return
-            self._first.append(turn.popleft())
-        question = self._first[0]
-        if question.node in self._assemblers[question.node].untrusted:
-            self._move_on(question, now_s)
+        if self._question is None:
+            self._question, self._asked = self._next(), 0
+        question = self._question
+        if question is None:
             return
-        session = self._ask(question.node, question.address)
-        self._pending = question, session
+        if not self._check.used(question.node):
+            self._move_on(now_s)
+            return
         self._asked += 1
-        session.poll(now_s)
+        self._session = self._ask(question.node, question.address)
+        self._session.poll(now_s)
 
-    def _move_on(self, question: _Question, now_s: float) -> None:
+    def _next(self) -> _Object | None:
+        """An object that was never asked for, else the one of a kind that was so longest ago."""
+        objects = self._check.objects
+        new = next((one for one in objects if one.asked_s == -math.inf), None)
+        if new is not None:
+            return new
+        self._unit = not self._unit
+        kind = (one for one in objects if (one.mapped is None) == self._unit)
+        return min(kind, key=lambda one: one.asked_s, default=None)
+
+    def _move_on(self, now_s: float) -> None:
         """The next question: soon, where a configuration has still to be confirmed."""
-        self._pending, self._asked = None, 0
-        self._first.popleft()
-        (self._units if question.is_unit else self._values).append(question)
-        self._due_s = now_s + (_FIRST_S if self._first else self._period_s)
+        if self._question is not None:
+            self._question.asked_s = now_s
+        self._question = self._session = None
+        soon = any(one.asked_s == -math.inf for one in self._check.objects)
+        self._due_s = now_s + (_FIRST_S if soon else self._period_s)

@@ -16,7 +16,7 @@ from drivelink.canopen.emcy import parse_emergency
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.sdo_sniffer import is_mapping, written_object
-from drivelink.cycle.following import OwnFollower, PassiveFollower
+from drivelink.cycle.following import MapFollower, PassiveFollower
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.objectcheck import ObjectCheck, ReadBack
 from drivelink.cycle.sources import OVERFLOW, LostSource
@@ -51,6 +51,7 @@ class Supervisor:
         self._loop = loop
         self._events = events
         self._configurator = configurator
+        self._check: ObjectCheck | None = None
         self._read_back: ReadBack | None = None
         self.bus = BusWatch(loop, events)  # watches SYNC, the bus and this machine
         self._joints = JointWatch(events, self.contradiction)
@@ -66,7 +67,7 @@ class Supervisor:
         self._follower = self._follow(configurator)
         loop.after_sync.append(self._sync)
 
-    def _follow(self, configurator: Configurator | PassiveConfigurator) -> PassiveFollower | OwnFollower:
+    def _follow(self, configurator: Configurator | PassiveConfigurator) -> MapFollower:
         """Follow the mappings, by frames in bus order."""
         loop, nodes = self._loop, self._nodes
         assemblers = {node: watched.assembler for node, watched in nodes.items()}
@@ -75,18 +76,15 @@ class Supervisor:
             for cob_id in (0, *(base + node for base in (0x580, 0x600) for node in nodes)):
                 loop.listeners[cob_id] = self._overhear
             return PassiveFollower(configurator, assemblers, layouts, self._use)
-        section = configurator.bus
+        section, check = configurator.bus, None
         if section.read_back_s:
-            check = ObjectCheck(section.sdo_timeout_s)
+            samples = {node: watched.loop_joint.pipeline.history.after for node, watched in nodes.items()}
+            self._check = check = ObjectCheck(section.sdo_timeout_s, samples)
             self._read_back = ReadBack(configurator.ask, section.read_back_s, check)
-            for watched in nodes.values():
-                self._read_back.watch(watched.layout, watched.loop_joint.pipeline)
         for node in nodes:
             loop.listeners[0x580 + node] = self._answer
             loop.listeners[0x600 + node] = self._foreign_request
-        follower = OwnFollower(
-            configurator, assemblers, layouts, self._use, self._read_back.check if self._read_back else None
-        )
+        follower = MapFollower(configurator, assemblers, layouts, self._use, check)
         loop.on_sent = lambda cob_id, data: follower.feed(
             cob_id, data, loop.clock() / _NS, loop.syncs - loop.cycles
         )
@@ -102,11 +100,9 @@ class Supervisor:
 
     def contradiction(self, loop_joint: LoopJoint) -> dict[str, Any] | None:
         """Return the reading that a second one contradicts, see `jointwatch`; None: none."""
-        pipeline = loop_joint.pipeline
-        found = contradiction(pipeline.assembler)
-        if found is None and self._read_back is not None:
-            found = self._read_back.contradiction(pipeline.assembler)
-        return found
+        assembler = loop_joint.pipeline.assembler
+        found = contradiction(assembler)
+        return self._check.contradiction(assembler) if found is None and self._check is not None else found
 
     def node_status(self, loop_joint: LoopJoint) -> dict[str, Any]:
         """State of one joint's nodes, for the status key."""
@@ -151,8 +147,6 @@ class Supervisor:
         watched.layout = layout
         if isinstance(self._configurator, PassiveConfigurator):
             return
-        if self._read_back is not None:
-            self._read_back.watch(layout, watched.loop_joint.pipeline)
         self._events.end(f"configure {node}")
         if not watched.started:
             self._events.report(f"node {node} is configured again and started")
@@ -271,13 +265,13 @@ class Supervisor:
         if self._configurator.busy:
             self._proceed(now_ns)  # do not decode its frames by the old layout
         elif self._read_back is not None:
-            self._read_back.feed(cob_id, data, now_ns / _NS)
+            self._read_back.feed(cob_id - 0x580, data, now_ns / _NS)
 
     def _foreign_request(self, cob_id: int, data: bytes) -> None:
         """Somebody else talks to a node by SDO; our own frames are not heard."""
         self._overhear(cob_id, data)
         if self._read_back is not None:
-            self._read_back.feed(cob_id, data, self._loop.clock() / _NS)
+            self._read_back.quiet(self._loop.clock() / _NS)
         address = written_object(data)
         if address is not None and is_mapping(address):
             text = f"node {cob_id - 0x600}: somebody else writes its mapping: it is configured again"

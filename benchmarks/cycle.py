@@ -1,36 +1,66 @@
-"""The work of one cycle: a two-motor VSA on the virtual bus, beside the textbook way and the floor.
+"""What a cycle costs and how late it is: the daemon beside the textbook way and the floor; start and memory.
 
     python benchmarks/cycle.py [--seconds S] [--rounds N]
 
-All variants make SYNC at 1 kHz for the same simulated devices, which answer in the thread that sends and
-whose CPU time is not counted, and publish in the same zenoh session to a subscriber in another process.
-Rounds alternate between them, so that all see the same machine. CPU is that of the whole process without
-the devices, over the SYNCs that were made, from the first one of each round on (locking memory and the
-collector's last look are of a start): SYNC, reception, estimation, publication, zenoh's own threads, and the
-threads that each variant brings with it. Work is wall-clock time from the last PDO in hand to the
-put returned.
+A two-motor VSA on the virtual bus. All variants make SYNC at 1 kHz for the same simulated devices, which
+answer in the thread that sends and whose CPU time is not counted, and publish in the same zenoh session to a
+subscriber in another process. Rounds alternate between them, so that all see the same machine. CPU is that of
+the whole process without the devices, over the SYNCs that were made, from the first one of each round on
+(locking memory and the collector's last look are of a start). Work is wall-clock time from the last PDO in
+hand to the put returned. SYNC is late by what passes from its deadline to the call that sends it.
+
+In lockstep world, devices, frames, cycles and puts of one or several joints take one thread, as fast as it
+goes. The baseline of the start is Python with the libraries that any such program imports.
 """
 
 from __future__ import annotations
 
+import math
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import scene
-import zenoh
-from rig import PERIOD_S, Devices, free_endpoint, joint, subscriber
+from rig import PERIOD_S, Devices, free_endpoint, joint, joint_text, subscriber
 from rivals import Floor, Textbook
 
 from drivelink.canopen.layout import NodeLayout, bus_load
 from drivelink.cycle import realtime
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simbus import open_sim_bus
-from drivelink.demo.simulate import network_from_joint
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.pubsub.session import close_session, open_session
+
+RECORDED = "drivelink, with a recorder"
+LOCKSTEP = (("robust", 1), ("paper", 1), ("robust", 4), ("robust", 16))  # mode, joints
+LIBRARIES = "import canopen, can, numpy, zenoh"
+BARE = f"import time; {LIBRARIES}; print(time.monotonic()); print(open('/proc/self/status').read())"
+START = """
+import re, sys, time
+from pathlib import Path
+def mb():
+    return int(re.search(r"VmRSS:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024
+from rig import Devices, joint
+from drivelink.daemon.service import Daemon, ServedJoint
+imported = time.monotonic()
+which = joint("robust", sys.argv[1])
+devices = Devices(which)
+with Daemon([ServedJoint(joint=which)], devices=devices.poll) as daemon:
+    ready = time.monotonic()
+    while daemon.loop.loop_joints[0].estimates == 0:
+        daemon.run_lockstep(1)
+    first = time.monotonic()
+    memory = [mb()]
+    for _ in range(2):
+        daemon.run_lockstep(10_000)
+        memory.append(mb())
+devices.close()
+print(imported, ready, first, *memory)
+"""
 
 
 class Row:
@@ -40,7 +70,7 @@ class Row:
         self.name = name
         self.cpu_s = self.wall_s = 0.0
         self.syncs = self.complete = 0
-        self.work: list[dict[str, float]] = []
+        self.spent: dict[str, list[float]] = {}
 
     def measure(self, devices: Devices, run: Callable[[], None]) -> None:
         """CPU of the process without that of the devices, over the SYNCs that were made."""
@@ -52,119 +82,177 @@ class Row:
         self.cpu_s += cpu_s
         self.syncs += syncs
 
+    def keep(self, complete: int, **times: Mapping[str, float]) -> None:
+        """Add a round's cycles, and the percentiles of its durations."""
+        self.complete += complete
+        for what, percentiles in times.items():
+            for name in ("p50_us", "p99_us", "p999_us", "max_us"):
+                self.spent.setdefault(f"{what}_{name}", []).append(percentiles.get(name, math.nan))
+
     def result(self) -> dict[str, Any]:
         """Totals; of the percentiles the median over the rounds."""
-
-        def middle(name: str) -> float:
-            return statistics.median(work[name] for work in self.work)
-
         return {
             "variant": self.name,
             "syncs": self.syncs,
             "complete": self.complete,
             "cpu_us_per_cycle": 1e6 * self.cpu_s / self.syncs,
             "cpu_of_a_core": self.cpu_s / self.wall_s,
-            "work_p50_us": middle("p50_us"),
-            "work_p99_us": middle("p99_us"),
-            "work_p999_us": middle("p999_us"),
+            **{name: statistics.median(values) for name, values in self.spent.items()},
         }
 
 
 def daemon_round(
-    row: Row, which: JointFile, devices: Devices, session: zenoh.Session, seconds: float
+    row: Row,
+    which: JointFile,
+    devices: Devices,
+    session: Any,
+    seconds: float,
+    real_time: bool = True,
 ) -> Mapping[int, NodeLayout]:
     """The daemon as `drivelink run` runs it, supervision, status key and housekeeping included."""
-    with Daemon([ServedJoint(joint=which)], session=session, devices=devices.poll) as daemon:
+    served = [ServedJoint(joint=which)]
+    with Daemon(served, session=session, real_time=real_time, devices=devices.poll) as daemon:
         row.measure(devices, lambda: daemon.run(seconds))
         (loop_joint,) = daemon.loop.loop_joints
-        row.complete += loop_joint.estimates
-        row.work.append(loop_joint.work.total())
+        row.keep(loop_joint.estimates, work=loop_joint.work.total(), late=daemon.loop.lateness.total())
         return dict(daemon.layouts)
 
 
-def rival_round(row: Row, rival: Textbook | Floor, devices: Devices, seconds: float) -> None:
+def rival_round(
+    row: Row, rival: Textbook | Floor, devices: Devices, seconds: float, real_time: bool = True
+) -> None:
     """A rival, with the same help of the operating system."""
-    obtained = realtime.acquire()
+    obtained = realtime.acquire(privileged=real_time)
     row.measure(devices, lambda: rival.run(seconds, devices))
     realtime.release(obtained)
-    row.complete += rival.cycles
-    row.work.append(rival.work.total())
+    row.keep(rival.cycles, work=rival.work.total(), late=rival.late.total())
     rival.close()
 
 
-def compare(seconds: float, rounds: int) -> list[dict[str, Any]]:
-    """All variants, round by round."""
+def recorded_round(row: Row, which: JointFile, text: str, devices: Devices, session, seconds: float) -> None:
+    """The daemon while `drivelink record` writes everything into a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bench.toml"
+        path.write_text(text, encoding="utf-8")
+        command = [sys.executable, "-m", "drivelink", "record", path, "--source", "daemon"]
+        command += ["--out", Path(folder) / "out.mcap", "--seconds", str(seconds + 3)]
+        recorder = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(2.5)  # until it listens
+        daemon_round(row, which, devices, session, seconds)
+        recorder.wait(timeout=60)
+
+
+def rows(args: Any) -> Iterator[scene.Row]:
+    """One row a variant, measured round by round."""
     endpoint = free_endpoint()
     robust, paper = joint("robust", endpoint), joint("paper", endpoint)
     session = open_session(robust.zenoh, Path())
     reader = subscriber(endpoint)
-    rows = [Row("drivelink, robust"), Row("drivelink, paper"), Row(Textbook.name), Row(Floor.name)]
-    devices = Devices(robust)
+    ordinary = ("drivelink, ordinary scheduling", "floor, ordinary scheduling")
+    names = ("drivelink, robust", "drivelink, paper", RECORDED, Textbook.name, Floor.name, *ordinary)
+    made = {name: Row(name) for name in names}
+    devices, seconds = Devices(robust), args.seconds
     try:
-        for _ in range(rounds):
-            layouts = daemon_round(rows[0], robust, devices, session, seconds)
-            daemon_round(rows[1], paper, devices, session, seconds)
-            rival_round(rows[2], Textbook(paper, devices.nodes, layouts, session), devices, seconds)
-            rival_round(rows[3], Floor(paper, layouts, session), devices, seconds)
+        for _ in range(args.rounds):
+            layouts = daemon_round(made["drivelink, robust"], robust, devices, session, seconds)
+            daemon_round(made["drivelink, paper"], paper, devices, session, seconds)
+            recorded_round(made[RECORDED], robust, joint_text("robust", endpoint), devices, session, seconds)
+            textbook = Textbook(paper, devices.network.nodes, layouts, session)
+            rival_round(made[Textbook.name], textbook, devices, seconds)
+            rival_round(made[Floor.name], Floor(paper, layouts, session), devices, seconds)
+            daemon_round(made[ordinary[0]], robust, devices, session, seconds, real_time=False)
+            rival_round(made[ordinary[1]], Floor(paper, layouts, session), devices, seconds, real_time=False)
     finally:
         devices.close()
         close_session(session)
         reader.communicate(b"")
-    load = bus_load(layouts.values(), BusSection(period_s=PERIOD_S))
-    results = [row.result() for row in rows]
-    for result in results:
-        result["bus_load_1_mbit"] = load.fraction
-        for name, baseline in (("textbook", results[2]), ("floor", results[3])):
-            result[f"cpu_against_{name}"] = result["cpu_us_per_cycle"] / baseline["cpu_us_per_cycle"]
-    return results
+    results = [row.result() for row in made.values()]
+    cost = {row["variant"]: row["cpu_us_per_cycle"] for row in results}
+    load = bus_load(layouts.values(), BusSection(period_s=PERIOD_S)).fraction
+    for row in results:
+        for name, rival in (("textbook", Textbook), ("floor", Floor)):
+            row[f"cpu_against_{name}"] = row["cpu_us_per_cycle"] / cost[rival.name]
+        yield row | {"bus_load_1_mbit": load}
 
 
-def lockstep(mode: str, seconds: float) -> dict[str, Any]:
-    """World, devices, frames, cycle and puts in one thread, as fast as it goes."""
-    which = joint(mode, free_endpoint())
-    session = open_session(which.zenoh, Path())
-    bus = open_sim_bus(which.bus)
-    network = network_from_joint(which, bus)
-    served = [ServedJoint(joint=which)]
-    with Daemon(served, session=session, real_time=False, devices=network.poll) as daemon:
-        start, cpu_s = time.perf_counter(), time.process_time()
+def lockstep(mode: str, joints: int, seconds: float) -> scene.Row:
+    """So many joints in lockstep; CPU without that of the devices."""
+    endpoint = free_endpoint()
+    served = [joint(mode, endpoint, index=index) for index in range(joints)]
+    session, devices = open_session(served[0].zenoh, Path()), Devices(*served)
+    daemons = [ServedJoint(joint=which) for which in served]
+    with Daemon(daemons, session=session, real_time=False, devices=devices.poll) as daemon:
+        devices.begin()
+        start = time.perf_counter()
         daemon.run_lockstep(round(seconds / PERIOD_S))
-        elapsed, cpu_s = time.perf_counter() - start, time.process_time() - cpu_s
-        work = daemon.loop.loop_joints[0].work.total()
-    bus.shutdown()
+        elapsed = time.perf_counter() - start
+        syncs, cpu_s = devices.counted()
+    devices.close()
     close_session(session)
     return {
-        "mode": mode,
-        "simulated_s": seconds,
-        "took_s": elapsed,
-        "cpu_s": cpu_s,
+        "mode": f"{mode}, {joints} joint{'s' if joints > 1 else ''}",
+        "joints": joints,
+        "cpu_us_per_cycle": 1e6 * cpu_s / syncs,
         "faster_than_real_time": seconds / elapsed,
-        **{f"work_{key}": value for key, value in work.items()},
     }
 
 
-def rows(args: Any) -> Iterator[scene.Row]:
-    """One row a variant."""
-    return iter(compare(args.seconds, args.rounds))
+def starts(count: int) -> dict[str, float]:
+    """Seconds from the process's start, and memory in MB; the median of so many."""
+    seen: list[dict[str, float]] = []
+    options = {"capture_output": True, "text": True, "check": True, "cwd": Path(__file__).parent}
+    for _ in range(count):
+        begin = time.monotonic()
+        bare = subprocess.run([sys.executable, "-c", BARE], **options)
+        kib = bare.stdout.partition("VmRSS:")[2].split()[0]
+        row = {"libraries_s": float(bare.stdout.split()[0]) - begin, "libraries_mb": int(kib) / 1024}
+        begin = time.monotonic()
+        ours = subprocess.run([sys.executable, "-c", START, free_endpoint()], **options)
+        *reached, started, after_10, after_20 = map(float, ours.stdout.split())
+        names = ("imported_s", "configured_s", "first_estimate_s")
+        row |= {name: at - begin for name, at in zip(names, reached, strict=True)}
+        seen.append(row | {"started_mb": started, "after_10_s_mb": after_10, "after_20_s_mb": after_20})
+    return {key: statistics.median([row[key] for row in seen]) for key in seen[0]}
 
 
-def flat_out(found: list[scene.Row]) -> str:
-    """The second table, and the load of the bus."""
+def after(found: list[scene.Row]) -> str:
+    """The recorder's cost, the bus, several joints, the start."""
+    cost = {row["variant"]: row["cpu_us_per_cycle"] for row in found}
+    load = found[0]["bus_load_1_mbit"]
+    lines = [
+        f"CPU a cycle with a recorder: {cost[RECORDED] / cost['drivelink, robust']:.2f}× of that without. "
+        f"Frames of this joint take {load:.0%} of 1 Mbit/s: the bus ends at {1e3 / load:.0f} Hz.\n"
+    ]
     columns = {
         "lockstep": "{mode}",
-        "10 s of VSA-II took": "{took_s:.2f} s",
-        "CPU": "{cpu_s:.2f} s",
+        "CPU a cycle / µs": "{cpu_us_per_cycle:.0f}",
         "faster than real time": "{faster_than_real_time:.1f}×",
-        "work p50 / p99 µs": "{work_p50_us:.0f} / {work_p99_us:.0f}",
     }
-    lines: list[str] = []
-    scene.table(columns, (lockstep(mode, 10.0) for mode in ("robust", "paper")), lines.append)
-    load = found[0]["bus_load_1_mbit"]
-    lines += ["", f"Frames of this joint take {load:.0%} of 1 Mbit/s: the bus ends at {1e3 / load:.0f} Hz."]
+    several = scene.table(columns, (lockstep(*case, 4.0) for case in LOCKSTEP), lines.append)
+    one, many = several[0], several[-1]
+    each = (many["cpu_us_per_cycle"] - one["cpu_us_per_cycle"]) / (many["joints"] - one["joints"])
+    lines.append(f"\nA further VSA joint takes {each:.0f} µs of a core in each cycle.\n")
+    start, said = starts(3), []
+    for key, what in (
+        ("libraries_s", f"Python and `{LIBRARIES}`"),
+        ("imported_s", "drivelink and its simulated devices imported"),
+        ("configured_s", "names claimed, nodes configured by SDO: ready"),
+        ("first_estimate_s", "first estimate published"),
+        ("libraries_mb", "memory of the libraries"),
+        ("started_mb", "at the first estimate, simulation included"),
+        ("after_10_s_mb", "after 10 s of cycles"),
+        ("after_20_s_mb", "after 20 s of cycles"),
+    ):
+        unit = key.rpartition("_")[2]
+        value = f"{start[key]:.2f} s" if unit == "s" else f"{start[key]:.0f} MB"
+        said.append({"what": what, "value": value, "ratio": start[key] / start[f"libraries_{unit}"]})
+    columns = {"start and memory": "{what}", "": "{value}", "of the libraries alone": "{ratio:.1f}×"}
+    scene.table(columns, said, lines.append)
     return "\n".join(lines)
 
 
 if __name__ == "__main__":
+    late = " / ".join(f"{{late_{p}_us:.0f}}" for p in ("p50", "p99", "p999", "max"))
     scene.main(
         __doc__,
         rows,
@@ -175,9 +263,10 @@ if __name__ == "__main__":
             "of textbook": "{cpu_against_textbook:.2f}×",
             "of floor": "{cpu_against_floor:.2f}×",
             "work p50 / p99 / p99.9 µs": "{work_p50_us:.0f} / {work_p99_us:.0f} / {work_p999_us:.0f}",
+            "SYNC late p50 / p99 / p99.9 / max µs": late,
             "cycles complete": "{complete} of {syncs}",
         },
         scene.Option("--seconds", 5.0, "of each round"),
         scene.Option("--rounds", 3),
-        after=flat_out,
+        after=after,
     )

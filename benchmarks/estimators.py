@@ -1,6 +1,6 @@
 """The on-line estimators on random joints: errors, 95 % intervals, false alarms, undeclared effects.
 
-    python benchmarks/estimators.py [--mode robust|paper|ekf] [--joints 8] [--seconds 20] [--cases NAME,…]
+    python benchmarks/estimators.py [--mode robust|paper] [--joints 8] [--seconds 20] [--cases NAME,…]
     python benchmarks/estimators.py --undeclared [--motion multisine|point-to-point|hand-guided|…]
 
 Fresh joints, read as drives read them: 4096 to 16384 counts (stiff joints behind a gear of 100), 16 to 18
@@ -12,8 +12,6 @@ The springs of the first table move on random multisines by the integrator of th
 With --undeclared the joints are those of an independent simulator in C (`world.c`), with cubic springs whose
 order is declared, and an effect of 3 to 8 % of the torque's amplitude that no file names. Names are counted
 by joints: in the end, and those that are given up again; the time is the median to the first of either.
-
---mode ekf runs an extended Kalman filter (`ekf.py`) over the first table's joints.
 """
 
 from __future__ import annotations
@@ -26,7 +24,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scene
-from ekf import Ekf
 from scene import joints
 from world import T, simulate
 
@@ -35,7 +32,6 @@ from estimator import (
     JointModel,
     Motor,
     Record,
-    Sample,
     Status,
     Transmission,
     make_estimator,
@@ -87,8 +83,6 @@ class Drawn(NamedTuple):
     model: JointModel
     record: Record
     stiffness_nm_rad: np.ndarray
-    torque_noise_nm: float = np.nan
-    jerk_rad_s3: float = np.nan  # rms, of the link
 
 
 def draw_joints(case: str, n_joints: int, seconds: float, seed: int) -> Iterator[Drawn]:
@@ -119,8 +113,7 @@ def draw_joints(case: str, n_joints: int, seconds: float, seed: int) -> Iterator
             (k_name, k), (shape_name, shape), low = declared[j]
             parameters = {k_name: off[0] * k, shape_name: low + off[1] * (shape - low)}
         known = joints.joint_model(B[j, 0], D[j, 0], model=model, order=order, parameters=parameters)
-        jerk = np.diff(truth.q[:, j].reshape(n), 3) / T**3
-        yield Drawn(known, record, truth.sigma[:, j, 0], noise, float(np.sqrt(np.mean(jerk**2))))
+        yield Drawn(known, record, truth.sigma[:, j, 0])
 
 
 def effects(rng: np.random.Generator, rated: float, stiffness: float) -> dict[str, dict[str, float | str]]:
@@ -192,44 +185,38 @@ def draw_undeclared(effect: str, count: int, seconds: float, motion: str) -> Ite
 
 
 def online(drawn: Drawn, mode: str) -> scene.Row:
-    """Run a mode over a recording: what is judged, alarms, effects named and after how long, µs a tick."""
-    if mode == "ekf":
-        return judged(drawn, Ekf(drawn).step, lambda out: out[:, 2] > 0)
-    estimator = make_estimator(drawn.model, EstimatorSettings(mode=mode), T)
-    after, named = np.nan, set()
+    """Run a mode over a recording: what is judged, alarms, effects named and after how long, µs a tick.
 
-    def step(sample: Sample) -> tuple[float, float, int]:
-        nonlocal after
+    Judged is what is usable after five seconds; NaN where nothing ever is.
+    """
+    estimator = make_estimator(drawn.model, EstimatorSettings(mode=mode), T)
+    after, named, out, spent_s = np.nan, set(), [], 0.0
+    for sample in drawn.record.samples():
+        start = time.process_time()
         estimate = estimator.step(sample)
+        spent_s += time.process_time() - start
+        out.append((estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad, estimate.status))
         if sample.sequence % 250 == 0 and (names := estimator.core.undeclared(0)):
             named.update(names)
             after = sample.sequence * T if np.isnan(after) else after
-        return estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad, estimate.status
-
-    found = judged(drawn, step, lambda out: out[:, 2].astype(int) & USABLE == USABLE)
-    last = set(estimator.core.undeclared(0))
-    return found | {"names": sorted(last), "meanwhile": sorted(named - last), "named_after_s": after}
-
-
-def judged(drawn: Drawn, step, usable) -> scene.Row:
-    """Judge what is usable after five seconds; NaN where nothing ever is."""
-    truth, samples = drawn.stiffness_nm_rad, list(drawn.record.samples())
-    start = time.process_time()
-    with np.errstate(all="ignore"):
-        out = np.array([step(sample) for sample in samples])
-    us = 1e6 * (time.process_time() - start) / len(samples)
-    chosen = usable(out) & (np.arange(len(truth)) * T >= SETTLED_S)
-    changed = out[:, 2].astype(int) & int(Status.CHANGED) > 0
+    truth, last = drawn.stiffness_nm_rad, set(estimator.core.undeclared(0))
+    stiffness, deviation, status = np.array(out).T
+    status = status.astype(int)
+    chosen = (status & USABLE == USABLE) & (np.arange(len(truth)) * T >= SETTLED_S)
+    changed = status & int(Status.CHANGED) > 0
     found = {
-        "us": us,
+        "us": 1e6 * spent_s / len(truth),
         "false_alarms": int(np.sum(changed[1:] & ~changed[:-1])),
         "usable": float(np.mean(chosen[round(SETTLED_S / T) :])),
         **dict.fromkeys(("rmse", "std", "coverage"), np.nan),
+        "names": sorted(last),
+        "meanwhile": sorted(named - last),
+        "named_after_s": after,
     }
     if not chosen.any():
         return found
     size = np.maximum(truth, 0.3 * np.sqrt(np.mean(truth**2)))[chosen]
-    error, std = out[chosen, 0] - truth[chosen], out[chosen, 1]
+    error, std = stiffness[chosen] - truth[chosen], deviation[chosen]
     return found | {
         "rmse": float(np.sqrt(np.mean((error / size) ** 2))),
         "std": float(np.median(std / size)),
@@ -245,7 +232,7 @@ def summary(case: str, found: list[scene.Row]) -> scene.Row:
         return float(figure(finite)) if finite else None
 
     def counted(key: str) -> str | None:
-        counts = Counter(name for one in found for name in one.get(key, ()))
+        counts = Counter(name for one in found for name in one[key])
         return ", ".join(f"{name} {count}" for name, count in counts.items()) or None
 
     return {
@@ -258,7 +245,7 @@ def summary(case: str, found: list[scene.Row]) -> scene.Row:
         "false_alarms": sum(one["false_alarms"] for one in found),
         "us": over("us", np.median),
         **{key: counted(key) for key in ("names", "meanwhile")},
-        "after_s": over("named_after_s", np.median) if "named_after_s" in found[0] else None,
+        "after_s": over("named_after_s", np.median),
     }
 
 
@@ -293,7 +280,7 @@ if __name__ == "__main__":
         __doc__,
         rows,
         COLUMNS | (NAMED if "--undeclared" in sys.argv else {"µs a tick": "{us:.1f}"}),
-        scene.Option("--mode", ("robust", "paper", "ekf")),
+        scene.Option("--mode", ("robust", "paper")),
         scene.Option("--joints", 8),
         scene.Option("--seconds", 20.0),
         scene.Option("--seed", 1, "of the springs"),

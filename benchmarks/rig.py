@@ -11,9 +11,8 @@ import can
 from can.interfaces.virtual import VirtualBus
 
 from drivelink.demo.simbus import open_sim_bus
-from drivelink.demo.simulate import network_from_joint
+from drivelink.demo.simulate import bench_from_joints
 from drivelink.jointfile import JointFile, parse
-from sim.canopen.node import Node
 
 __all__ = ["PERIOD_S", "AnsweringBus", "Devices", "free_endpoint", "joint", "joint_text", "subscriber"]
 
@@ -108,30 +107,17 @@ class Devices:
     """
 
     def __init__(self, *joints: JointFile) -> None:
-        self._buses = [open_sim_bus(which.bus) for which in joints]
-        self.networks = [
-            network_from_joint(which, bus) for which, bus in zip(joints, self._buses, strict=True)
-        ]
+        self._bus = open_sim_bus(joints[0].bus)
+        self.network = bench_from_joints(joints).network(self._bus)
         self.cpu_s = 0.0
         self._begin: tuple[int, float] | None = None
-
-    @property
-    def nodes(self) -> list[Node]:
-        """All devices."""
-        return [node for network in self.networks for node in network.nodes]
-
-    @property
-    def syncs(self) -> int:
-        """SYNCs seen."""
-        return self.networks[0].syncs
 
     def poll(self) -> None:
         """Let them answer."""
         start = time.thread_time()
-        for network in self.networks:
-            network.poll()
-        if self._begin is None and self.syncs:
-            self._begin = (self.syncs, time.process_time() - self.cpu_s)
+        self.network.poll()
+        if self._begin is None and self.network.syncs:
+            self._begin = (self.network.syncs, time.process_time() - self.cpu_s)
         self.cpu_s += time.thread_time() - start
 
     def begin(self) -> None:
@@ -143,12 +129,11 @@ class Devices:
         if self._begin is None:
             return 0, 0.0
         syncs, cpu_s = self._begin
-        return self.syncs - syncs, time.process_time() - self.cpu_s - cpu_s
+        return self.network.syncs - syncs, time.process_time() - self.cpu_s - cpu_s
 
     def close(self) -> None:
         """Take them off the bus."""
-        for bus in self._buses:
-            bus.shutdown()
+        self._bus.shutdown()
 
 
 class AnsweringBus(VirtualBus):

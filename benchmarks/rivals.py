@@ -17,7 +17,7 @@ from rig import AnsweringBus, Devices
 from drivelink._core import SYNC_COB_ID, LatencyHistogram, encode_estimate
 from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.cycle.realtime import Alarm
-from drivelink.cycle.sources import FrameSource, open_source
+from drivelink.cycle.sources import open_source
 from drivelink.jointfile import JointFile
 from estimator.sample import Estimate, TransmissionEstimate
 from sim.canopen.edsfile import node_eds
@@ -81,7 +81,7 @@ class Textbook:
     def __init__(
         self, joint: JointFile, devices: list[Node], layouts: Mapping[int, NodeLayout], session: zenoh.Session
     ) -> None:
-        self.work = LatencyHistogram()
+        self.work, self.late = LatencyHistogram(), LatencyHistogram()  # canopen's own thread makes SYNC
         self.cycles = 0
         self._joint = joint
         self._estimator = NumpyPaper(joint)
@@ -161,7 +161,7 @@ class Floor:
     name = "floor: unpack and put, no estimator"
 
     def __init__(self, joint: JointFile, layouts: Mapping[int, NodeLayout], session: zenoh.Session) -> None:
-        self.work = LatencyHistogram()
+        self.work, self.late = LatencyHistogram(), LatencyHistogram()
         self.cycles = 0
         self._joint = joint
         self._formats = {layout.tpdos[0].cob_id: struct.Struct("<ihH") for layout in layouts.values()}
@@ -174,21 +174,6 @@ class Floor:
         one = TransmissionEstimate(1.0, 2.0, 3.0, 4.0)
         self._payload = encode_estimate(Estimate(0, 3, 1.0, 2.0, 3.0, (one, one)), 0)
 
-    def take(self, source: FrameSource) -> int:
-        """Receive and unpack; how many PDOs there were."""
-        got = 0
-        for cob_id, data, _ in source.take():
-            if cob_id in self._formats:
-                self._formats[cob_id].unpack_from(data)
-                got += 1
-        return got
-
-    def put(self) -> None:
-        """Publish as many bytes as an estimate and a sample have."""
-        estimate, sample = self._publishers
-        estimate.put(self._payload)
-        sample.put(self._payload[:72])
-
     def run(self, seconds: float, devices: Devices) -> None:
         """The loop."""
         bus = can.Bus(interface="virtual", channel=self._joint.bus.channel)
@@ -197,13 +182,19 @@ class Floor:
         end = clock() + round(seconds * 1e9)
         deadline = clock() + period
         while deadline < end:
+            self.late.add(clock() - deadline + period)
             source.send(SYNC_COB_ID, b"")
             got = 0
             while got < len(self._formats) and source.wait(max(deadline - clock(), 0) * 1e-9):
                 since = clock()
-                got += self.take(source)
+                for cob_id, data, _ in source.take():
+                    if cob_id in self._formats:
+                        self._formats[cob_id].unpack_from(data)
+                        got += 1
             if got == len(self._formats):
-                self.put()
+                estimate, sample = self._publishers
+                estimate.put(self._payload)
+                sample.put(self._payload[:72])
                 self.work.add(clock() - since)
                 self.cycles += 1
             alarm.sleep_until(deadline)

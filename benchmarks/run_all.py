@@ -36,9 +36,7 @@ class Section(NamedTuple):
 
 
 SECTIONS = {
-    "cycle": Section("One cycle beside the textbook way and the floor", quick="--seconds 2 --rounds 2"),
-    "stages": Section("Stages, and joints on one core", quick="--cycles 2000"),
-    "service": Section("Jitter, recorder, start, memory", quick="--seconds 2 --rounds 1"),
+    "cycle": Section("One cycle beside the textbook way and the floor", quick="--seconds 2 --rounds 1"),
     "estimator_tick": Section("The estimator alone", quick="--ticks 8000"),
     "paper_table": Section("The paper's table"),
     "ensembles": Section("The estimator on random joints", quick="--joints 1", of="estimators"),
@@ -46,12 +44,6 @@ SECTIONS = {
         "Effects that nobody declared, on an independent simulator",
         "--undeclared --seconds 30",
         "--joints 1",
-        of="estimators",
-    ),
-    "ekf": Section(
-        "An extended Kalman filter on the same joints",
-        "--mode ekf --joints 6",
-        "--cases linear",
         of="estimators",
     ),
     "diagnosis_seeds": Section(
@@ -64,7 +56,6 @@ SECTIONS = {
     ),
     "healthy": Section("Second recordings of healthy joints", quick="--seeds 2"),
     "real_data": Section("Real data before and after"),
-    "constants": Section("Choice constants halved and doubled", "--report"),
     "external": Section("External torque and contact", quick="--minutes 2 --errors 2 --joints sea"),
     "fault_matrix": Section(
         "Sensor faults: wrong samples called valid", quick="--joints constant --seconds 8"

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
-    "ROOT", "Columns", "Option", "Row", "diagnosiskit", "faultmatrix", "fleetkit", "joints",
-    "main", "table",
+    "ROOT", "Columns", "Option", "Row", "diagnosiskit", "faultmatrix", "fleetkit", "gatekit", "joints",
+    "literals", "main", "table",
 ]  # fmt: skip
 
 Row = dict[str, Any]
@@ -27,7 +27,9 @@ sys.path.append(str(ROOT / "tests"))  # the simulators and stages that the tests
 import diagnosiskit  # noqa: E402
 import faultmatrix  # noqa: E402
 import fleetkit  # noqa: E402
+import gatekit  # noqa: E402
 import joints  # noqa: E402
+import literals  # noqa: E402
 
 
 class _Cells(string.Formatter):

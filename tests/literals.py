@@ -1,4 +1,4 @@
-"""Numbers inside functions of the estimator, in both languages, and what each of them is.
+"""Numbers of the estimator, in both languages, and what each of them is.
 
 A choice that might be another number belongs into a table (`estimator.choices`, `estimator.priors`) or to the
 constants at the top of its module, with unit and reason. What stands here is a property of mathematics, of a grid that
@@ -8,9 +8,11 @@ is refined afterwards, or of rounding.
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 _PLAIN = {0.0, 0.25, 0.5, 0.75, 1.5, *map(float, range(11)), 12.0}  # counts, halves, exponents
 _UNITS = {100.0, 1000.0, 3600.0}  # per cent, milli, seconds in an hour
@@ -112,3 +114,84 @@ def _rust(path: Path) -> Iterator[tuple[int, float]]:
         if not re.match(r"\s*(pub(\(\w+\))? )?(const|static) ", code):
             for found in re.findall(r"(?<![\w.])\d[\d_]*(?:\.\d+)?(?:e-?\d+)?(?![\w.])", code):
                 yield number, float(found.replace("_", ""))
+
+
+NO_CHOICE = {  # mathematics, units, rounding, and what a format or the literature defines
+    "diagnosis.candidates.LAWS": "Dahl's law, Bouc-Wen with equal parts, elastic up to the limit",
+    "diagnosis.covariance._FULL": "keeps rounding from dividing by zero",
+    "diagnosis.curves._DEGREE": "cubic splines",
+    "diagnosis.motion._GENERATIONS": "effort of a search",
+    "diagnosis.motion._POPULATION": "effort of a search",
+    "diagnosis.motion._STEPS": "of a second-order integrator in a period of the bandwidth",
+    "diagnosis.shape._CUBIC": "least degree whose bend is not constant",
+    "driven._NEWTON": "steps, that converge quadratically",
+    "driven._PASSES": "of a fixed point whose error falls by the effect's share each time",
+    "driven._RESOLVED": "of a second-order integrator: an oscillation of which a step is a twelfth",
+    "driven._STEP": "of a difference: square root of the rounding, in rad",
+    "flexibility.RELATIVE_STEP": "of central differences: cube root of the rounding",
+    "freerun._CUBIC": "least degree whose slope is exact to second order",
+    "freerun._SMOOTHED": "samples: the least that average an encoder's rounding, short of the motion's bends",
+    "freerun._STEP": "of a difference: square root of the rounding, in rad/s",
+    "freerun._SUBSTEPS": "of a second-order integrator: its error is a sixteenth of one step's",
+    "gate.causes._DEGREE": "unit",
+    "gate.causes._MILLI": "unit",
+    "gate.balance._RIDGE": "keeps rounding from deciding between parallel columns",
+    "gate.decision._TURN": "one revolution",
+    "gate.usable._ABSURD": "one over the rounding",
+    "model.HIGHEST_ORDER": "of a polynomial in the joint file",
+    "model_monitor._LEAST_SECONDS": "that a standard deviation takes",
+    "model_monitor._NOTHING": "keeps a logarithm finite",
+    "sample.SIGMA_95": "quantile of the normal distribution",
+}
+
+
+class Constant(NamedTuple):
+    """Where a number stands: module, name, key in a table (None: it is the number itself), value."""
+
+    module: str
+    name: str
+    key: str | None
+    value: float | tuple[float, ...]
+
+    @property
+    def label(self) -> str:
+        """Its name for people."""
+        return f"{self.module.removeprefix('estimator.')}.{self.key or self.name}"
+
+    def set(self, factor: float) -> None:
+        """Put an entry of a table in with a factor, for this process; whole numbers stay whole and above zero."""
+        table = getattr(importlib.import_module(self.module), self.name)
+        entry = table[self.key]
+        field = "std" if hasattr(entry, "std") else "value"
+        table[self.key] = entry._replace(**{field: _times(getattr(entry, field), factor)})
+
+
+def _times(value: Any, factor: float) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_times(x, factor) for x in value)
+    if 0.5 < value < 1.0:  # a share
+        return 1.0 - (1.0 - value) / factor
+    return max(1, round(value * factor)) if isinstance(value, int) else value * factor
+
+
+def constants(estimator: Path) -> Iterator[Constant]:
+    """Choices, in the order of the modules: entries of the tables, and what `NO_CHOICE` does not explain."""
+    for path in sorted(estimator.rglob("*.py")):
+        parts = path.relative_to(estimator.parent).with_suffix("").parts
+        module = ".".join(parts).removesuffix(".__init__")
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+            if not isinstance(node, ast.Assign | ast.AnnAssign) or not isinstance(target, ast.Name):
+                continue
+            value = getattr(importlib.import_module(module), target.id, None)
+            if target.id in ("PRIORS", "CHOICES") and isinstance(value, dict):
+                for key, entry in value.items():
+                    yield Constant(module, target.id, key, getattr(entry, "std", None) or entry.value)
+            elif _number(value) and f"{module.removeprefix('estimator.')}.{target.id}" not in NO_CHOICE:
+                yield Constant(module, target.id, None, value)
+
+
+def _number(value: object) -> bool:
+    if type(value) is tuple:
+        return bool(value) and all(_number(x) for x in value)
+    return isinstance(value, int | float) and not isinstance(value, bool)

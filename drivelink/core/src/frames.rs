@@ -52,14 +52,15 @@ pub struct Field {
 
 impl Field {
     fn new(mapped: &MappedObject, bit: u32, target: usize) -> Field {
+        let range = mapped.range();
         Field {
             place: Place { bit, bits: mapped.bits, signed: mapped.signed },
             target,
             checks: mapped.signal.checks(),
             scale: mapped.scale,
             offset: mapped.offset,
-            range: mapped.range,
-            longest: mapped.range / if mapped.range >= WIDE { 4 } else { 1 },
+            range,
+            longest: range / if range >= WIDE { 4 } else { 1 },
             last: None,
             total: 0,
         }
@@ -225,8 +226,9 @@ impl TpdoDecoder {
 mod tests {
     use super::*;
 
-    fn position(bits: u32, signed: bool, range: i128) -> MappedObject {
-        MappedObject { signal: Signal::MotorPosition, bits, signed, scale: 1.0, offset: 0.0, range }
+    fn position(bits: u32, signed: bool, modulus: i128) -> MappedObject {
+        let signal = Signal::MotorPosition;
+        MappedObject { signal, bits, signed, scale: 1.0, offset: 0.0, wraps: true, modulus }
     }
 
     #[test]
@@ -246,7 +248,7 @@ mod tests {
 
     #[test]
     fn a_counter_goes_on_where_it_rolls_over() {
-        let mut field = Field::new(&position(16, false, 1 << 16), 0, 0);
+        let mut field = Field::new(&position(16, false, 0), 0, 0);
         let truth: Vec<i64> = (0..2000).map(|k| 100 * k - 300).collect();
         for &count in &truth {
             assert_eq!(field.take(&(count as u16).to_le_bytes()), count as f64);

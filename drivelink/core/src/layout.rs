@@ -31,8 +31,10 @@ pub enum Signal {
 
 /// One object in a TPDO.
 #[derive(Clone, Debug)]
+#[cfg_attr(feature = "python", derive(pyo3::FromPyObject))]
 pub struct MappedObject {
     /// What it means.
+    #[cfg_attr(feature = "python", pyo3(from_py_with = crate::python::signal_of))]
     pub signal: Signal,
     /// Its length in the frame, at most 64 for a signal that is used.
     pub bits: u32,
@@ -42,8 +44,22 @@ pub struct MappedObject {
     pub scale: f64,
     /// SI units, subtracted after scaling.
     pub offset: f64,
+    /// Whether the counter rolls over.
+    pub wraps: bool,
+    /// Counts after which it does; 0: at its length.
+    pub modulus: i128,
+}
+
+impl MappedObject {
     /// Counts after which it rolls over; 0: never.
-    pub range: i128,
+    #[must_use]
+    pub fn range(&self) -> i128 {
+        match (self.wraps, self.modulus) {
+            (false, _) => 0,
+            (true, 0) => 1 << self.bits,
+            (true, modulus) => modulus,
+        }
+    }
 }
 
 impl Signal {
@@ -63,6 +79,7 @@ impl Signal {
 
 /// One TPDO: its identifier and the objects in it, in order from bit 0.
 #[derive(Clone, Debug)]
+#[cfg_attr(feature = "python", derive(pyo3::FromPyObject))]
 pub struct Tpdo {
     /// Identifier of the frame, 11 bits.
     pub cob_id: u32,
@@ -74,6 +91,7 @@ pub struct Tpdo {
 
 /// One node of a joint.
 #[derive(Clone, Debug)]
+#[cfg_attr(feature = "python", derive(pyo3::FromPyObject))]
 pub struct Node {
     /// 1 to 127.
     pub node_id: u32,

@@ -5,7 +5,7 @@ use estimator_core::sample::MOTORS;
 use super::status::CONTRADICTED;
 use super::{Assembler, COB_IDS, Receiver, SYNC_COB_ID, VALUES};
 use crate::frames::TpdoDecoder;
-use crate::layout;
+use crate::layout::{self, Signal};
 use crate::node::Node;
 
 impl Assembler {
@@ -103,6 +103,9 @@ impl Assembler {
             return Err(format!("node {node_id}: expected a node of this joint"));
         };
         for tpdo in &layout.tpdos {
+            if tpdo.objects.iter().any(|mapped| mapped.signal != Signal::Other && mapped.bits > 64) {
+                return Err(format!("0x{:03X}: expected objects of at most 64 bits", tpdo.cob_id));
+            }
             if self.decoders.iter().any(|decoder| decoder.cob_id == tpdo.cob_id) {
                 return Err(format!("node {node_id}: COB-ID 0x{:03X} is used by two TPDOs", tpdo.cob_id));
             }

@@ -2,7 +2,7 @@ use super::*;
 use crate::layout::{MappedObject, Node as Layout, Signal, Tpdo};
 
 fn object(signal: Signal, bits: u32, scale: f64) -> MappedObject {
-    MappedObject { signal, bits, signed: true, scale, offset: 0.0, range: 0 }
+    MappedObject { signal, bits, signed: true, scale, offset: 0.0, wraps: false, modulus: 0 }
 }
 
 /// A drive with position and torque at 0x181, an encoder at 0x183.

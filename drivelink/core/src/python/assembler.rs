@@ -1,5 +1,6 @@
 //! `Assembler` and the counters of its nodes.
 
+use std::collections::BTreeMap;
 use std::sync::Mutex;
 
 use estimator_core::python::sample_object;
@@ -7,9 +8,10 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
 use super::lock;
-use super::values::{NodeFields, drive_error, node_of};
+use super::values::drive_error;
 use crate::assembler;
 use crate::cross_check::{CrossCheck, Verdict};
+use crate::layout::Node;
 use crate::node::Counters;
 
 #[pymethods]
@@ -50,13 +52,12 @@ impl Assembler {
     #[pyo3(signature = (layouts, motors, *, active = true, hold_periods = 250, period_s = 0.001))]
     fn new(
         py: Python<'_>,
-        layouts: Vec<NodeFields>,
+        layouts: Vec<Node>,
         motors: usize,
         active: bool,
         hold_periods: i64,
         period_s: f64,
     ) -> PyResult<Assembler> {
-        let layouts = layouts.into_iter().map(|layout| node_of(py, layout)).collect::<PyResult<Vec<_>>>()?;
         let core = assembler::Assembler::new(&layouts, motors, active, hold_periods, period_s)
             .map_err(|message| drive_error(py, message))?;
         Ok(Assembler { core: Mutex::new(core) })
@@ -84,33 +85,21 @@ impl Assembler {
     }
 
     #[getter]
-    fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let counters: Vec<_> = lock(&self.core).nodes().iter().map(|n| (n.node_id, n.counters)).collect();
-        let found = PyDict::new(py);
-        for (node_id, counted) in counters {
-            found.set_item(node_id, counted.into_pyobject(py)?)?;
-        }
-        Ok(found)
+    fn counters(&self) -> BTreeMap<u32, Counters> {
+        lock(&self.core).nodes().iter().map(|node| (node.node_id, node.counters)).collect()
     }
 
     #[getter]
-    fn faults<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let found = PyDict::new(py);
-        for node in lock(&self.core).nodes().iter().filter(|node| node.faulted || node.emergency != 0) {
-            found.set_item(node.node_id, node.emergency)?;
-        }
-        Ok(found)
+    fn faults(&self) -> BTreeMap<u32, u16> {
+        let core = lock(&self.core);
+        let faulted = core.nodes().iter().filter(|node| node.faulted || node.emergency != 0);
+        faulted.map(|node| (node.node_id, node.emergency)).collect()
     }
 
     #[getter]
-    fn statuswords<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let found = PyDict::new(py);
-        for node in lock(&self.core).nodes() {
-            if let Some(statusword) = node.statusword {
-                found.set_item(node.node_id, statusword)?;
-            }
-        }
-        Ok(found)
+    fn statuswords(&self) -> BTreeMap<u32, i64> {
+        let core = lock(&self.core);
+        core.nodes().iter().filter_map(|node| Some((node.node_id, node.statusword?))).collect()
     }
 
     #[getter]
@@ -175,8 +164,7 @@ impl Assembler {
         lock(&self.core).contradict(node_id, contradicted);
     }
 
-    fn relayout(&self, py: Python<'_>, layout: NodeFields) -> PyResult<()> {
-        let layout = node_of(py, layout)?;
+    fn relayout(&self, py: Python<'_>, layout: Node) -> PyResult<()> {
         let changed = lock(&self.core).relayout(&layout);
         changed.map_err(|message| drive_error(py, message))
     }

@@ -7,7 +7,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
-use crate::layout::{MappedObject, Node, Signal, Tpdo};
+use crate::layout::Signal;
 use crate::wire;
 
 pub(super) fn drive_error(py: Python<'_>, message: String) -> PyErr {
@@ -103,38 +103,9 @@ pub(super) fn encode_external<'py>(
     Ok(PyBytes::new(py, wire::encode_external(&external, stamp_ns).bytes()))
 }
 
-/// A `MappedObject` of Python.
-#[derive(FromPyObject)]
-struct MappedFields {
-    signal: String,
-    index: u32,
-    subindex: u32,
-    bits: u32,
-    signed: bool,
-    scale: f64,
-    wraps: bool,
-    offset: f64,
-    modulus: i128,
-}
-
-/// A `TpdoLayout` of Python.
-#[derive(FromPyObject)]
-struct TpdoFields {
-    cob_id: u32,
-    objects: Vec<MappedFields>,
-    transmission_type: u32,
-}
-
-/// A `NodeLayout` of Python.
-#[derive(FromPyObject)]
-pub(super) struct NodeFields {
-    node_id: u32,
-    motor: Option<usize>,
-    tpdos: Vec<TpdoFields>,
-}
-
-fn mapped_of(from: MappedFields) -> Result<MappedObject, String> {
-    let signal = match from.signal.as_str() {
+/// What a mapped object of Python means.
+pub(crate) fn signal_of(object: &Bound<'_, PyAny>) -> PyResult<Signal> {
+    Ok(match object.extract::<String>()?.as_str() {
         "motor_position" => Signal::MotorPosition,
         "motor_velocity" => Signal::MotorVelocity,
         "motor_torque" => Signal::MotorTorque,
@@ -147,26 +118,5 @@ fn mapped_of(from: MappedFields) -> Result<MappedObject, String> {
         "following_error" => Signal::FollowingError,
         "position_demand" => Signal::PositionDemand,
         _ => Signal::Other,
-    };
-    let MappedFields { index, subindex, bits, signed, scale, offset, .. } = from;
-    if bits > 64 && signal != Signal::Other {
-        return Err(format!("0x{index:04X}:{subindex:02X}: expected at most 64 bits, got {bits}"));
-    }
-    let range = match (from.wraps, from.modulus) {
-        (false, _) => 0,
-        (true, 0) => 1 << bits,
-        (true, modulus) => modulus,
-    };
-    Ok(MappedObject { signal, bits, signed, scale, offset, range })
-}
-
-pub(super) fn node_of(py: Python<'_>, from: NodeFields) -> PyResult<Node> {
-    let tpdo_of = |tpdo: TpdoFields| {
-        let TpdoFields { cob_id, objects, transmission_type } = tpdo;
-        let objects = objects.into_iter().map(mapped_of).collect::<Result<_, _>>()?;
-        Ok(Tpdo { cob_id: cob_id & 0x7FF, objects, transmission_type })
-    };
-    let tpdos = from.tpdos.into_iter().map(tpdo_of).collect::<Result<_, String>>();
-    let tpdos = tpdos.map_err(|message| drive_error(py, message))?;
-    Ok(Node { node_id: from.node_id, motor: from.motor, tpdos })
+    })
 }

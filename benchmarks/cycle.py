@@ -178,7 +178,7 @@ def rows(args: Any) -> Iterator[scene.Row]:
 def lockstep(mode: str, joints: int, seconds: float) -> scene.Row:
     """So many joints in lockstep; CPU without that of the devices."""
     endpoint = free_endpoint()
-    served = [joint(mode, endpoint, index=index) for index in range(joints)]
+    served = [joint(mode, endpoint, index) for index in range(joints)]
     session, devices = open_session(served[0].zenoh, Path()), Devices(*served)
     daemons = [ServedJoint(joint=which) for which in served]
     with Daemon(daemons, session=session, real_time=False, devices=devices.poll) as daemon:

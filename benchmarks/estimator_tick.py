@@ -17,9 +17,8 @@ from dataclasses import replace
 import numpy as np
 import scene
 from diagnosis_seeds import measured
-from rig import free_endpoint
-from rig import joint as joint_file
 
+from drivelink import jointfile
 from estimator import EstimatorSettings, JointModel, Motor, Record, Sample, Transmission, fit, make_estimator
 from estimator.diagnosis import diagnose
 from estimator.model_monitor import ModelMonitor, measure_baseline
@@ -110,7 +109,7 @@ def batch(name: str) -> float:
 
 def diagnosis(seconds: float) -> float:
     """CPU seconds to diagnose one motor at 1 kHz."""
-    declared = joint_file("robust", free_endpoint(), motors=1)
+    declared = jointfile.load(scene.ROOT / "drivelink" / "joints" / "quadratic.toml")
     data = measured(declared, seconds, ["coulomb_friction=0.0005"])
     begin = time.thread_time()
     diagnose(data, declared.model())

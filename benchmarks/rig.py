@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import can
 from can.interfaces.virtual import VirtualBus
 
+import drivelink
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import bench_from_joints
 from drivelink.jointfile import JointFile, parse
@@ -17,35 +20,8 @@ from drivelink.jointfile import JointFile, parse
 __all__ = ["PERIOD_S", "AnsweringBus", "Devices", "free_endpoint", "joint", "joint_text", "subscriber"]
 
 PERIOD_S = 0.001
-JOINT = """
-name = "{name}"
-arrangement = "{arrangement}"
-{motors}
-[link.encoder]
-source = "cia406"
-node_id = {link_node}
-[bus]
-channel = "bench"
-bitrate = 8_000_000  # a virtual bus carries more joints than a real one
-[estimator]
-mode = "{mode}"
-[zenoh]
-endpoint = "{endpoint}"
-[sim]
-case = "{case}"
-"""
-MOTOR = """[[motor]]
-inertia_kg_m2 = {}
-viscous_damping_nm_s_rad = {}
-[motor.transmission]
-model = "polynomial"
-order = 2
-[motor.drive]
-node_id = {}
-gear_ratio = 20.0
-torque_constant_nm_a = 0.02
-"""
-CONSTANTS = {1: (0.05, 0.001), 2: (0.0005, 0.005)}  # inertia and damping of the simulated cases, by motors
+VSA = (Path(drivelink.__file__).parent / "joints" / "vsa-ii.toml").read_text(encoding="utf-8")
+NODES = {"1": 1, "2": 2, "10": 3}  # of that file, and those of the first joint here
 SUBSCRIBER = """
 import sys, time
 from drivelink.pubsub.session import open_client
@@ -59,30 +35,24 @@ session.close()
 """
 
 
-def joint_text(mode: str, endpoint: str, *, index: int = 0, motors: int = 2) -> str:
-    """The joint file of the paper's VSA-II, or of its quadratic joint with one motor.
+def joint_text(mode: str, endpoint: str, index: int = 0) -> str:
+    """The joint file of the paper's VSA-II, without link dynamics.
 
     Args:
         mode: of the estimator.
         endpoint: zenoh's.
-        index: of several on one bus.
-        motors: 1 or 2.
+        index: of several on one bus, which is virtual and carries more of them than a real one.
     """
-    first = 3 * index + 1
-    return JOINT.format(
-        name="bench" if index == 0 else f"bench{index}",
-        arrangement="antagonistic" if motors == 2 else "single",
-        motors="".join(MOTOR.format(*CONSTANTS[motors], first + i) for i in range(motors)),
-        link_node=first + 2,
-        mode=mode,
-        endpoint=endpoint,
-        case="vsa-ii" if motors == 2 else "quadratic",
-    )
+    text = re.sub(r"\[link\.dynamics\][^\[]*", "", VSA)
+    text = re.sub(r"node_id = (\d+)", lambda found: f"node_id = {3 * index + NODES[found[1]]}", text)
+    text = text.replace('name = "vsa-ii"', f'name = "bench{index or ""}"')
+    text = text.replace("[bus]", "[bus]\nbitrate = 8_000_000")
+    return f'{text}\n[estimator]\nmode = "{mode}"\n[zenoh]\nendpoint = "{endpoint}"\n'
 
 
-def joint(mode: str, endpoint: str, *, index: int = 0, motors: int = 2) -> JointFile:
+def joint(mode: str, endpoint: str, index: int = 0) -> JointFile:
     """The same, read."""
-    return parse(joint_text(mode, endpoint, index=index, motors=motors))
+    return parse(joint_text(mode, endpoint, index))
 
 
 def free_endpoint() -> str:

@@ -1,4 +1,4 @@
-"""Every claim of speed and accuracy in one command: writes results.md and results.json beside this file.
+"""Every claim of speed and accuracy in one command: writes results.md beside this file.
 
     python benchmarks/run_all.py [--quick] [--only NAME ...] [--out DIR]
 
@@ -10,7 +10,6 @@ A section whose data or tool is not there is left out, and the results say so.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
 import re
@@ -20,9 +19,12 @@ import tempfile
 import time
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 HERE = Path(__file__).parent
+HEAD = (
+    "# Results\n\nWritten by `python benchmarks/run_all.py`; [README.md](README.md) says what each measures."
+)
 TIMEOUT_S = 7200  # of a section: the longest takes a quarter of an hour on two quiet cores
 
 
@@ -71,69 +73,36 @@ SECTIONS = {
 }
 
 
-def machine() -> dict[str, Any]:
+def machine() -> str:
     """What numbers are taken on."""
     names = re.findall(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    return {
-        "processor": names[0] if names else platform.machine(),
-        "cores": os.cpu_count(),
-        "system": f"{platform.system()} {platform.release()}",
-        "python": platform.python_version(),
-        **{name: version(name) for name in ("numpy", "python-can", "eclipse-zenoh")},
-    }
+    libraries = (f"{name} {version(name)}" for name in ("numpy", "python-can", "eclipse-zenoh"))
+    processor = f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
+    system = f"{platform.system()} {platform.release()}, Python {platform.python_version()}"
+    return f"{processor}, {system}, {', '.join(libraries)}."
 
 
-def run(name: str, quick: bool) -> dict[str, Any]:
-    """Run a section; what it printed, its numbers, or why there are none."""
-    section = SECTIONS[name]
+def run(name: str, quick: bool) -> str:
+    """Run a section; its Markdown below the title, or why there is none."""
+    section, load = SECTIONS[name], os.getloadavg()[0]
     program = f"{section.of or name}.py"
     arguments = f"{section.full} {section.quick if quick else ''}".split()
-    start = time.monotonic()
-    result: dict[str, Any] = {
-        "title": section.title,
-        "machine": machine(),
-        "at": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
-        "load": os.getloadavg()[0],
-        "command": " ".join(["python", f"benchmarks/{program}", *arguments]),
-    }
+    start, at = time.monotonic(), time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     with tempfile.TemporaryDirectory() as folder:
-        numbers = Path(folder) / "numbers.json"
-        command = ["timeout", str(TIMEOUT_S), sys.executable, HERE / program, *arguments, "--json", numbers]
+        command = ["timeout", str(TIMEOUT_S), sys.executable, HERE / program, *arguments]
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
         done = subprocess.run(
             command, capture_output=True, text=True, cwd=folder, env=environment, check=False
         )
-        result["took_s"] = round(time.monotonic() - start, 1)
-        if done.returncode != 0:
-            lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
-            return {**result, "skipped": lines[-1]}
-        result["text"] = done.stdout.rstrip()
-        if numbers.exists():
-            result["numbers"] = json.loads(numbers.read_text(encoding="utf-8"))
-    return result
-
-
-def document(results: dict[str, Any]) -> str:
-    """The results in Markdown."""
-    lines = [
-        "# Results",
-        "",
-        "Written by `python benchmarks/run_all.py`; [README.md](README.md) says what each measures.",
-    ]
-    for name, result in results["sections"].items():
-        lines += ["", f"## {result['title']}", ""]
-        if "skipped" in result:
-            lines.append(f"Left out: `{name}`: {result['skipped']}")
-            continue
-        lines += [
-            f"`{result['command']}`, {result['at']}, {result['took_s']:.0f} s, "
-            f"load of the machine before: {result['load']:.1f}.",
-            "",
-            ", ".join(f"{name} {value}" for name, value in result["machine"].items()) + ".",
-            "",
-            result["text"] if result["text"].startswith("|") else f"```\n{result['text']}\n```",
-        ]
-    return "\n".join(lines) + "\n"
+    if done.returncode != 0:
+        lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
+        return f"Left out: `{name}`: {lines[-1]}"
+    shown, took_s = " ".join(["python", f"benchmarks/{program}", *arguments]), time.monotonic() - start
+    text = done.stdout.rstrip()
+    return (
+        f"`{shown}`, {at}, {took_s:.0f} s, load of the machine before: {load:.1f}.\n\n{machine()}\n\n"
+        f"{text if text.startswith('|') else f'```{chr(10)}{text}{chr(10)}```'}"
+    )
 
 
 def main() -> None:
@@ -144,24 +113,21 @@ def main() -> None:
     parser.add_argument(
         "--only", nargs="+", choices=names, default=names, metavar="NAME", help=", ".join(names)
     )
-    parser.add_argument("--out", type=Path, default=HERE, help="where results.md and results.json go")
+    parser.add_argument("--out", type=Path, default=HERE / "results.md", metavar="FILE")
     args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    path = args.out / "results.json"
-    before = json.loads(path.read_text(encoding="utf-8"))["sections"] if path.exists() else {}
-    sections: dict[str, Any] = {}
-    for name in names:
-        if name in args.only:
-            print(f"{name}: {SECTIONS[name].title} …", flush=True)
-            sections[name] = run(name, args.quick)
-            print(f"  {sections[name].get('skipped', 'done')}", flush=True)
-        elif name in before:
-            sections[name] = before[name]
-        together = before | sections
-        results = {"sections": {name: together[name] for name in names if name in together}}
-        path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-        (args.out / "results.md").write_text(document(results), encoding="utf-8")
-    print(f"{args.out / 'results.md'}, {path}")
+    before = args.out.read_text(encoding="utf-8") if args.out.exists() else ""
+    made = {}
+    for part in before.split("\n## ")[1:]:
+        title, _, text = part.partition("\n")
+        made[title] = text.strip()
+    for name in args.only:
+        title = SECTIONS[name].title
+        print(f"{name}: {title} …", flush=True)
+        made[title] = run(name, args.quick)
+        known = [section.title for section in SECTIONS.values() if section.title in made]
+        parts = [HEAD, *(f"## {title}\n\n{made[title]}" for title in known)]
+        args.out.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    print(args.out)
 
 
 if __name__ == "__main__":

@@ -131,18 +131,8 @@ class Rendezvous:
                 self._closed.wait(_ATTEMPT_S)
 
     def _listen(self) -> bool:
-        config = zenoh.Config()
-        settings = {
-            "mode": "peer",
-            "listen/endpoints": [self._endpoint],
-            "scouting/multicast/enabled": False,
-            "adminspace/enabled": False,
-            "transport/shared_memory/enabled": False,
-        }
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
         try:
-            session = zenoh.open(config)
+            session = zenoh.open(daemon_config(self._endpoint, listen=True))
         except zenoh.ZError:
             return False
         with self._lock:

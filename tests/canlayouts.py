@@ -25,12 +25,12 @@ def drive(node_id: int, motor: int | None, transmission_type: int = 1) -> NodeLa
     return NodeLayout(node_id=node_id, motor=motor, tpdos=(tpdo,))
 
 
-def encoder(node_id: int, bits: int = 32, modulus: int = 0, offset: float = 0.0) -> NodeLayout:
+def encoder(node_id: int) -> NodeLayout:
     """A CiA 406 encoder node: 0x6004."""
-    wrapped = {"wraps": True, "modulus": modulus, "offset": offset}
-    position = mapped(Signal.LINK_POSITION, 0x6004, bits=bits, signed=False, scale=LINK_RAD, **wrapped)
-    tpdo = TpdoLayout(cob_id=0x180 + node_id, objects=(position,))
-    return NodeLayout(node_id=node_id, motor=None, tpdos=(tpdo,))
+    position = mapped(Signal.LINK_POSITION, 0x6004, signed=False, scale=LINK_RAD, wraps=True)
+    return NodeLayout(
+        node_id=node_id, motor=None, tpdos=(TpdoLayout(cob_id=0x180 + node_id, objects=(position,)),)
+    )
 
 
 VSA = (drive(1, 0), drive(2, 1), encoder(3))

@@ -18,15 +18,21 @@ import random
 import struct
 from collections import Counter, deque
 from collections.abc import Iterable
+from types import SimpleNamespace
+from typing import Any
 
 import can
 from canopenkit import drive_objects
 from fuzznodes import FuzzNode, encoder_objects, trap_objects
 
-from drivelink.cycle.loop import CycleLoop
 from drivelink.cycle.sources import CanFrame
 
 __all__ = ["MIXES", "FuzzBus"]
+
+
+def _message(cob_id: int, data: bytes) -> can.Message:
+    return can.Message(arbitration_id=cob_id, data=data, is_extended_id=False)
+
 
 Mix = tuple[float, float, float]
 
@@ -50,7 +56,6 @@ class FuzzBus:
             FuzzNode(2, drive_objects(2)),
             FuzzNode(3, encoder_objects(3), starts_itself=True),
         ]
-        self.loop: CycleLoop | None = None
         self.errors: dict[str, int] = {}
         self.lost_sends = self.tick = self.frames = self._stamp_ns = 0
         self.rate, self.mix = 0.0, MIXES[0]
@@ -62,19 +67,11 @@ class FuzzBus:
         self._late: list[tuple[int, bytes]] = []
         self._recent: deque[tuple[int, bytes]] = deque(maxlen=64)
 
-    # FrameBus, for the configuration before the start
-
-    def send_message(self, msg: can.Message) -> None:
-        if self.loop is None:
-            self.send(msg.arbitration_id, bytes(msg.data))
-        else:
-            self.loop.send(msg.arbitration_id, bytes(msg.data))
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        if not self._queue:
-            return None
-        cob_id, data = self._queue.popleft()
-        return can.Message(arbitration_id=cob_id, data=data, is_extended_id=False)
+    @property
+    def wire(self) -> Any:
+        """As configuration sees it before the loop runs."""
+        take = lambda _timeout=None: _message(*self._queue.popleft()) if self._queue else None  # noqa: E731
+        return SimpleNamespace(send=lambda msg, _: self.send(msg.arbitration_id, bytes(msg.data)), recv=take)
 
     # FrameSource
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import random
 from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
-import can
 from daemonkit import vsa_text
 from fuzzbus import MIXES, FuzzBus
 
@@ -18,6 +18,7 @@ from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.pipeline import build
+from drivelink.cycle.startup import BusPort
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile, parse
@@ -64,17 +65,6 @@ class ForeignMaster:
 
     def send(self, cob_id: int, data: bytes) -> None:
         raise AssertionError(f"a passive daemon has sent 0x{cob_id:03X} [{data.hex(' ')}]")
-
-
-class _Port:
-    """The configuration's way to the bus, before the loop runs and while it does."""
-
-    def __init__(self, bus: FuzzBus) -> None:
-        self._bus = bus
-        self.recv = bus.recv
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        self._bus.send_message(msg)
 
 
 class _Judge:
@@ -130,7 +120,7 @@ class FuzzRun:
         self.seed = seed
         self.joint: JointFile = parse(vsa_text(bus=FOLLOW if passive else ""))
         self.bus = FuzzBus(random.Random(seed), hostile=self.hostile)
-        port: Any = _Port(self.bus)
+        port = BusPort(self.bus.wire)
         self.configurator, (layouts,) = configure_joints(port, [parse(vsa_text())])
         self._scales = _scales(layouts)
         estimator = build(self.joint)[0] if real else Witness()
@@ -145,8 +135,10 @@ class FuzzRun:
             "counter_overflow": overflow,
         }
         self.loop = CycleLoop(source, [loop_joint], **how)
-        self.bus.loop = self.loop
-        self.events = EventLog(_Silent(), clock=lambda: self.loop.clock() * 1e-9)  # type: ignore[arg-type]
+        port.loop = self.loop
+        silent = logging.getLogger("fuzzed")
+        silent.disabled = True
+        self.events = EventLog(silent, clock=lambda: self.loop.clock() * 1e-9)
         watching = PassiveConfigurator([self.joint]) if passive else self.configurator
         self.supervisor = Supervisor(self.loop, {loop_joint: layouts}, self.events, watching)
         self.loop.on_fault = _reraise  # whatever the daemon would survive is a failure here
@@ -226,10 +218,3 @@ def _scales(layouts: Iterable[NodeLayout]) -> dict[str, float]:
 
 def _reraise(_where: str, error: Exception) -> None:
     raise error
-
-
-class _Silent:
-    """A log that nobody reads."""
-
-    def log(self, *_: object) -> None:
-        pass

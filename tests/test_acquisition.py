@@ -2,13 +2,12 @@
 
 import math
 import random
-import struct
 
 import pytest
-from canlayouts import COUNT_RAD, LINK_RAD, VSA, drive, encoder, link, pdo, vsa_cycle
+from canlayouts import COUNT_RAD, LINK_RAD, VSA, drive, link, pdo, vsa_cycle
 
 from drivelink._core import LATE, Assembler, JointPipeline
-from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
+from drivelink.canopen.layout import NodeLayout, TpdoLayout
 from drivelink.errors import DriveError
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
@@ -18,22 +17,6 @@ MS = 1_000_000
 
 def run(assembler: Assembler, frames: list[tuple[int, bytes]]) -> list[Sample]:
     return [sample for frame in frames if (sample := assembler.feed(*frame)) is not None]
-
-
-def test_a_missing_frame_is_a_gap_known_by_node_and_never_filled():
-    assembler = Assembler(VSA, 2)
-    run(assembler, [(SYNC, b""), *vsa_cycle(0)])
-    assert run(assembler, [(SYNC, b""), *vsa_cycle(1)[:2]]) == []
-    assembler.feed(SYNC, b"")
-    assert assembler.missed == 1
-    assert assembler.flags & Status.BUS_FAULT
-    assert [assembler.counters[n].missing for n in (1, 2, 3)] == [0, 0, 1]
-    run(assembler, vsa_cycle(2))
-    sample = assembler.feed(SYNC, b"")  # doubtful until its end: the one frame could have been the late one
-    assert sample is not None
-    assert (sample.sequence, sample.link_position_rad) == (2, 2 * LINK_RAD)
-    assert assembler.flags & Status.BUS_FAULT
-    assert assembler.missed == -1
 
 
 def test_a_late_frame_is_counted_late_and_not_taken_for_the_next_cycles():
@@ -102,20 +85,6 @@ def test_samples_after_a_lost_frame_stay_flagged_until_it_cannot_be_a_late_one()
     assert assembler.complete
 
 
-@pytest.mark.parametrize(("bits", "modulus", "offset"), [(16, 0, 0.0), (32, 0, 0.0), (32, 5000, 0.25)])
-def test_a_counter_that_rolls_over_goes_on(bits, modulus, offset):
-    span = modulus or 1 << bits  # or it rolls over at its measuring range
-    assembler = Assembler((drive(1, 0), encoder(3, bits=bits, modulus=modulus, offset=offset)), 1)
-    code = "<H" if bits == 16 else "<I"
-    truth = [100 * k - 300 for k in range(10)] + [600 - 100 * k for k in range(20)]
-    found = []
-    for count in truth:
-        frames = [(SYNC, b""), (0x181, pdo(0)), (0x183, struct.pack(code, count % span))]
-        found += [s.link_position_rad for s in run(assembler, frames)]
-    # The first reading is the one nearest zero, from there on nothing rolls over.
-    assert found == pytest.approx([count * LINK_RAD - offset for count in truth], abs=1e-9)
-
-
 def test_a_forged_reading_does_not_leave_the_counter_a_turn_off():
     rng = random.Random(2)
     assembler = Assembler((drive(1, 0),), 1)
@@ -161,26 +130,6 @@ def test_a_rebooted_node_is_not_believed_before_it_is_started_again():
     run(assembler, vsa_cycle(4))
     assembler.feed(SYNC, b"")
     assert not assembler.flags & Status.NODE_RESTARTED
-
-
-@pytest.mark.parametrize(
-    ("writes", "lost"),
-    [
-        (["2F60600006000000"], [True]),  # mode of operation: homing, and another again
-        (["2F60600006000000", "2F60600008000000", "2F60600009000000"], [True, True, False]),
-        (["237C600010270000", "2F98600023000000"], [True, True]),  # home offset, homing method
-        (["217C600004000000", "C67C600004000000"], [True, True]),  # by segments, by blocks
-        (["2F60600008000000", "407C600000000000", "2381600010270000", "2F6060", "8060600000000000"], [False] * 5),
-    ],
-)  # fmt: skip
-def test_an_overheard_homing_has_lost_the_zero(writes, lost):
-    assembler = Assembler(VSA, 2)
-    run(assembler, [(SYNC, b""), *vsa_cycle(0)])
-    found = []
-    for k, write in enumerate(writes, start=1):
-        run(assembler, [(0x603, bytes.fromhex(write)), (SYNC, b""), *vsa_cycle(k)])
-        found.append(bool(assembler.flags & Status.NODE_RESTARTED))
-    assert found == lost
 
 
 def test_no_zero_is_believed_while_a_homing_runs_and_its_end_is_told():
@@ -283,30 +232,6 @@ def test_all_event_driven_nodes_give_the_sample_at_the_end_of_the_cycle():
     assert sample is not None
     assert (sample.sequence, sample.motor_position_rad[0]) == (0, 2 * COUNT_RAD)
     assert assembler.counters[1].duplicate == 0
-
-
-def test_objects_of_any_length_are_decoded_bit_by_bit():
-    rng = random.Random(3)
-    signals = [Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.MOTOR_VELOCITY, Signal.LINK_POSITION]
-    for _ in range(200):
-        objects, word, shift, truth = [], 0, 0, {}
-        for signal in rng.sample([*signals, Signal.OTHER, Signal.OTHER], 6):
-            bits, signed = rng.randint(1, 20), rng.random() < 0.5
-            low = -(1 << bits - 1) if signed else 0
-            truth[signal] = rng.randint(low, low + (1 << bits) - 1)
-            objects.append(MappedObject(signal=signal, index=0x2000, subindex=0, bits=bits, signed=signed))
-            word |= (truth[signal] & (1 << bits) - 1) << shift
-            shift += bits
-        tpdo = TpdoLayout(cob_id=0x181, objects=tuple(objects))
-        assembler = Assembler((NodeLayout(node_id=1, motor=0, tpdos=(tpdo,)),), 1)
-        size = next(n for n in (*range(9), 12, 16) if n >= tpdo.length)  # CAN FD pads
-        (sample,) = run(assembler, [(SYNC, b""), (0x181, word.to_bytes(size, "little"))])
-        assert [
-            sample.motor_position_rad[0],
-            sample.motor_torque_nm[0],
-            sample.motor_velocity_rad_s[0],
-            sample.link_position_rad,
-        ] == [truth[signal] for signal in signals]
 
 
 def test_the_answers_to_a_late_sync_are_of_no_sample_and_spoil_none():

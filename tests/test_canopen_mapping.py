@@ -7,7 +7,6 @@ from canopenkit import (
     INVALID,
     NO_RTR,
     READ_ONLY,
-    Item,
     Slave,
     Wire,
     configure,
@@ -247,25 +246,6 @@ def test_unneeded_frames_are_switched_off_where_the_load_demands_it():
     assert all(slave.objects[0x1801, 1].value & INVALID for slave in slaves)
     # SYNC 55 + 4 frames of 135 bits at 1 kHz, four heartbeats of 65 bits at 10 Hz
     assert configurator.load().bits_per_s == pytest.approx(1000 * (55 + 4 * 135) + 4 * 10 * 65)
-
-
-def test_a_link_encoder_of_its_own_is_a_third_node():
-    encoder = {
-        (0x1000, 0): u32(0x00010196),
-        (0x1017, 0): Item(0, 2, True),
-        (0x6004, 0): u32(77, mappable=True),
-        (0x6501, 0): u32(8192),
-        (0x6502, 0): u32(4096),
-    } | tpdo(1, NO_RTR | 0x189, 254, 0x60040020)
-    wire = Wire([drive(), Slave(9, encoder)])
-    text = joint_text(link='[link.encoder]\nsource = "cia406"\nnode_id = 9\ndirection = -1\noffset_rad = 0.5')
-    layouts = configure(wire, parse(text))
-    assert [(layout.node_id, layout.motor) for layout in layouts] == [(5, 0), (9, None)]
-    (mapped,) = layouts[1].tpdos[0].objects
-    assert (mapped.signal, mapped.signed, mapped.wraps) == (Signal.LINK_POSITION, False, True)
-    assert mapped.modulus == 8192 * 4096
-    assert mapped.offset == 0.5
-    assert mapped.scale == pytest.approx(-2 * 3.141592653589793 / 8192)
 
 
 def ended(configurator, wire):

@@ -6,7 +6,6 @@ import can
 import pytest
 from canopenkit import configure, joint_text
 
-from drivelink.canopen.configure import configure_joints
 from drivelink.canopen.guard import check_frame
 from drivelink.canopen.layout import Signal
 from drivelink.demo.simulate import network_from_joint
@@ -71,29 +70,6 @@ def test_every_makers_drive_is_configured_and_its_frames_decode(rig, quirks):
             lengths[message.arbitration_id] = len(message.data)
     for frame in drive.tpdos + encoder.tpdos:
         assert lengths[frame.cob_id] == frame.length
-
-
-@pytest.mark.parametrize("quirks", ["strict", "keeps-pdos", "self-starting", "synapticon"])
-def test_after_a_reboot_the_same_layout_comes_back(rig, quirks):
-    bus, joint, network = rig(quirks)
-    configurator, ((drive, _),) = configure_joints(bus, [joint], idle=network.poll)
-    bus.inner.send(can.Message(arbitration_id=0, data=b"\x81\x05", is_extended_id=False))
-    network.poll()
-    booted, ended, now = False, [], 0.0
-    for _ in range(5000):
-        now += 0.001
-        ended += configurator.poll(now)
-        network.poll()
-        while (message := bus.recv(0.0)) is not None:
-            if message.arbitration_id == 0x705 and message.data[0] == 0 and not booted:
-                booted = True
-                configurator.start(5)
-            configurator.feed(message.arbitration_id, bytes(message.data), now)
-        if ended:
-            break
-    ((node, layout),) = ended
-    assert node == 5
-    assert layout.tpdos == drive.tpdos
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ def test_a_wrong_object_is_one_line(text):
     ],
 )
 def test_absolute_encoders_report_resolution_and_where_they_start_again(reported, counts, modulus):
-    text = joint_text(link='[link.encoder]\nsource = "cia406"\nnode_id = 9')
+    text = joint_text(link='[link.encoder]\nsource = "cia406"\nnode_id = 9\ndirection = -1\noffset_rad = 0.5')
     (candidate,) = offer(roles(parse(text))[1], reported, GENERIC).candidates[Signal.LINK_POSITION]
-    assert candidate.scale == pytest.approx(math.tau / counts)
-    assert candidate.modulus == modulus
+    assert candidate.scale == pytest.approx(-math.tau / counts)
+    assert (candidate.modulus, candidate.offset, candidate.signed) == (modulus, 0.5, False)

@@ -181,20 +181,3 @@ def test_an_emergency_reaches_the_master_and_its_history():
         peer.sdo[0x6040].raw = 0x80
         assert (peer.emcy.log[-1].code, peer.emcy.log[-1].register) == (0, 0)  # before the SDO response
         assert peer.sdo[0x6041].raw & 0x4F == 0x40
-
-
-def test_units_are_readable_and_the_velocity_follows_its_unit():
-    rig = StubRig()
-    data = DriveData(rated_current_ma=2000, rated_torque_mnm=100, counts_per_rev=4096, gear=(20, 1))
-    with mastered(Cia402Drive(1, rig, 0, data), rig=rig) as master:
-        sdo = remote(master).sdo
-        assert (sdo[0x6077].raw, sdo[0x6078].raw) == (500, 250)  # 0.05 N·m of 0.1 N·m, 0.5 A of 2 A
-        assert [sdo[index][k].raw for index in (0x608F, 0x6091) for k in (1, 2)] == [4096, 1, 20, 1]
-        # rpm, 1e-3 rpm, 0.1 counts/s, rad/s
-        for unit, expected in ((0x00B44700, 30), (0xFDB44700, 30000), (0xFFB50300, 20480), (0x00100300, 3)):
-            sdo[0x60A9].raw = unit
-            assert sdo[0x606C].raw == expected
-        sdo[0x607E].raw = 0x40  # velocity polarity
-        assert sdo[0x606C].raw == -3
-        with pytest.raises(SdoAbortedError, match="0x06090030"):
-            sdo[0x60A9].raw = 0x00FF0300

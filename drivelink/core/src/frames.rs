@@ -256,6 +256,14 @@ mod tests {
     }
 
     #[test]
+    fn more_than_eight_bytes_travel_in_the_next_length_of_can_fd() {
+        let objects = vec![position(40, false, 0), position(40, false, 0)];
+        let tpdo = Tpdo { cob_id: 0x181, objects, transmission_type: 1 };
+        let decoder = TpdoDecoder::new(&tpdo, 0, Some(0), 1);
+        assert_eq!([9, 10, 12, 16].map(|length| decoder.fits(length)), [false, true, true, false]);
+    }
+
+    #[test]
     fn the_first_reading_is_the_one_nearest_zero() {
         let mut field = Field::new(&position(32, false, 5000), 0, 0);
         assert_eq!(field.take(&4900u32.to_le_bytes()), -100.0);

@@ -222,24 +222,25 @@ mod tests {
 
     #[test]
     fn a_homing_and_another_home_offset_lose_the_zero() {
-        let request = |index: u16, value: u8| {
-            let [low, high] = index.to_le_bytes();
-            [0x2F, low, high, 0, value, 0, 0, 0]
-        };
-        for (index, value, lost) in
-            [(MODE, HOMING, true), (MODE, 8, false), (0x607C, 0, true), (0x6040, 6, false)]
-        {
+        for (sent, lost) in [
+            ([0x2F, 0x60, 0x60, 0, HOMING, 0, 0, 0], true),
+            ([0x2F, 0x60, 0x60, 0, 8, 0, 0, 0], false),
+            ([0x23, 0x7C, 0x60, 0, 0x10, 0x27, 0, 0], true),
+            ([0x2F, 0x98, 0x60, 0, 0x23, 0, 0, 0], true), // homing method
+            ([0x21, 0x7C, 0x60, 0, 4, 0, 0, 0], true),    // by segments
+            ([0xC6, 0x7C, 0x60, 0, 4, 0, 0, 0], true),    // by blocks
+            ([0x40, 0x7C, 0x60, 0, 0, 0, 0, 0], false),   // an upload changes nothing
+            ([0x80, 0x60, 0x60, 0, HOMING, 0, 0, 0], false),
+            ([0x23, 0x81, 0x60, 0, 0x10, 0x27, 0, 0], false),
+        ] {
             let mut node = Node::new(1, true);
-            node.request(&request(index, value));
-            assert_eq!(node.restarted, lost, "{index:#x}");
-            let mut node = Node::new(1, true);
-            node.request(&[0x40, request(index, value)[1], request(index, value)[2], 0, value, 0, 0, 0]);
-            assert!(!node.restarted, "an upload changes nothing");
+            node.request(&sent);
+            assert_eq!(node.restarted, lost, "{sent:x?}");
         }
         let mut node = Node::new(1, true);
-        node.request(&request(MODE, HOMING));
+        node.request(&[0x2F, 0x60, 0x60, 0, HOMING, 0, 0, 0]);
         node.restarted = false;
-        node.request(&request(MODE, 8)); // the homing is over
+        node.request(&[0x2F, 0x60, 0x60, 0, 8, 0, 0, 0]); // the homing is over
         assert!(node.restarted);
     }
 

@@ -2,7 +2,6 @@
 //!
 //! Adds the service's status bits: drive faults, missing frames, stale estimates.
 
-use estimator_core::estimator::Estimator;
 use estimator_core::external::External;
 use estimator_core::sample::status::{MODEL_ALARM, RESTARTED, USABLE, VALID};
 use estimator_core::sample::{Estimate, Sample};
@@ -51,30 +50,6 @@ pub trait Step: Send {
     /// As for `step`.
     fn external(&mut self) -> Result<Option<External>, Failure> {
         Ok(None)
-    }
-}
-
-impl Step for Estimator {
-    fn step(&mut self, sample: &Sample) -> Result<Estimate, Failure> {
-        Ok(Estimator::step(self, sample))
-    }
-
-    fn lose_zeros(&mut self) -> Result<(), Failure> {
-        Estimator::lose_zeros(self);
-        Ok(())
-    }
-
-    fn distrust(&mut self) -> Result<(), Failure> {
-        Estimator::distrust(self);
-        Ok(())
-    }
-
-    fn delay_next(&mut self, late_s: f64) {
-        Estimator::delay_next(self, late_s);
-    }
-
-    fn external(&mut self) -> Result<Option<External>, Failure> {
-        Ok(Estimator::external(self))
     }
 }
 

@@ -55,7 +55,7 @@ class Configurator:
         self.layouts: dict[int, NodeLayout] = {}
         self.drop_others = False
         self._sessions: dict[int, Session[NodeLayout]] = {}
-        self._broken: dict[int, DriveError] = {}  # nodes whose configuration ended with an internal error
+        self._ended: list[tuple[int, NodeLayout | DriveError]] = []  # since the last poll
 
     @property
     def nodes(self) -> tuple[int, ...]:
@@ -90,41 +90,38 @@ class Configurator:
     @property
     def busy(self) -> bool:
         """Whether any configuration is under way."""
-        return bool(self._sessions or self._broken)
+        return bool(self._sessions or self._ended)
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
         """Take a frame; only SDO responses (0x581 to 0x5FF) are of interest."""
         node = cob_id - 0x580
-        session = self._sessions.get(node)
-        if session is None:
-            return
-        try:
-            session.feed(cob_id, data, now_s)
-        except Exception as error:  # noqa: BLE001 - whatever a node provokes ends its own part
-            self._break_off(node, error)
+        if node in self._sessions:
+            self._advance(node, lambda session: session.feed(cob_id, data, now_s))
 
     def poll(self, now_s: float) -> list[tuple[int, NodeLayout | DriveError]]:
         """Advance the configurations; return finished nodes with their new layout or error."""
-        ended: list[tuple[int, NodeLayout | DriveError]] = []
-        for node, session in list(self._sessions.items()):
-            try:
-                if not session.poll(now_s):
-                    continue
-                del self._sessions[node]
-                self.layouts[node] = session.result
-                ended.append((node, session.result))
-            except DriveError as error:
-                ended.append((node, error))
-            except Exception as error:  # noqa: BLE001 - as in `feed`
-                self._break_off(node, error)
-        ended += self._broken.items()
-        self._broken.clear()
+        for node in list(self._sessions):
+            self._advance(node, lambda session: session.poll(now_s))
+        ended, self._ended = self._ended, []
+        self.layouts |= {node: result for node, result in ended if isinstance(result, NodeLayout)}
         return ended
 
-    def _break_off(self, node: int, error: Exception) -> None:
-        self._sessions.pop(node, None)
-        logger.debug("the configuration of node %d has failed", node, exc_info=error)
-        self._broken[node] = DriveError(f"node {node}: {type(error).__name__} in its configuration: {error}")
+    def _advance(self, node: int, step: Callable[[Session[NodeLayout]], object]) -> None:
+        """Let a configuration go on; whatever the node provokes ends its own one."""
+        session = self._sessions[node]
+        result: NodeLayout | DriveError
+        try:
+            step(session)
+            if not session.done:
+                return
+            result = session.result
+        except DriveError as error:
+            result = error
+        except Exception as error:
+            logger.debug("the configuration of node %d has failed", node, exc_info=error)
+            result = DriveError(f"node {node}: {type(error).__name__} in its configuration: {error}")
+        del self._sessions[node]
+        self._ended.append((node, result))
 
     def load(self) -> BusLoad:
         """Return the bus load of all configured nodes."""

@@ -22,8 +22,10 @@ INVALID = 1 << 31
 NO_RTR = 1 << 30
 EXTENDED = 1 << 29
 SYNC_TYPES = range(1, 241)
+FRAME_BITS = 64
 
 _MOST_TPDOS = 16  # TPDO numbers that are read; no known drive uses higher ones
+_MOST_ENTRIES = 64  # objects of one bit
 _ALWAYS = 4  # some makers leave gaps among the first four
 
 
@@ -115,30 +117,19 @@ def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo 
     """
     read = _read_exactly if exactly else read_optional
     communication, mapping = 0x17FF + number, 0x19FF + number
-    cob = yield from read(node, communication, 1)
-    if cob is None:
+    values = {(communication, 1): (yield from read(node, communication, 1))}
+    if values[communication, 1] is None:
         return None
-    transmission_type = yield from read(node, communication, 2)
-    inhibit = yield from read_optional(node, communication, 3)
-    event = yield from read_optional(node, communication, 5)
-    count = yield from read(node, mapping, 0)
-    known = count is not None
-    entries: list[Entry] = []
-    for subindex in range(1, min(count or 0, 64) + 1):
-        raw = yield from read(node, mapping, subindex)
-        known = known and raw is not None
-        if not raw:  # some count empty entries
+    values[communication, 2] = yield from read(node, communication, 2)
+    for subindex in (3, 5):
+        values[communication, subindex] = yield from read_optional(node, communication, subindex)
+    count = values[mapping, 0] = yield from read(node, mapping, 0)
+    for subindex in range(1, min(count or 0, _MOST_ENTRIES) + 1):
+        raw = values[mapping, subindex] = yield from read(node, mapping, subindex)
+        if not raw:
             break
-        entries.append((raw >> 16, raw >> 8 & 0xFF, raw & 0xFF))
-    return Tpdo(
-        number=number,
-        cob=cob,
-        transmission_type=255 if transmission_type is None else transmission_type,
-        inhibit_100us=inhibit or 0,
-        event_ms=event or 0,
-        entries=tuple(entries) if (known := known and sum(bits for _, _, bits in entries) <= 64) else (),
-        known=known,
-    )
+    (tpdo,) = tpdos_of({address: value for address, value in values.items() if value is not None})
+    return tpdo
 
 
 def read_tpdos(node: int) -> Program[tuple[Tpdo, ...]]:
@@ -194,15 +185,18 @@ def objects_of(tpdo: Tpdo, number: int) -> dict[Address, int]:
 
 
 def _entries(values: Mapping[Address, int], mapping: int) -> tuple[Entry, ...] | None:
-    """The entries; None if one of them is unknown."""
+    """The entries; None if one of them is unknown, or they are more than a frame carries."""
     count = values.get((mapping, 0))
     entries: list[Entry] = []
-    for subindex in range(1, 65 if count is None else min(count, 64) + 1):
-        raw = values.get((mapping, subindex), 0)
-        if not raw:  # a data sheet without a count: the first empty entry ends the list
-            return tuple(entries) if count is None and entries else None
+    for subindex in range(1, (_MOST_ENTRIES if count is None else min(count, _MOST_ENTRIES)) + 1):
+        raw = values.get((mapping, subindex))
+        if not raw:  # some count empty entries; a data sheet without a count: the first one ends the list
+            if raw is None and (count is not None or not entries):
+                return None
+            break
         entries.append((raw >> 16 & 0xFFFF, raw >> 8 & 0xFF, raw & 0xFF))
-    return tuple(entries)
+    known = (count is not None or entries) and sum(bits for _, _, bits in entries) <= FRAME_BITS
+    return tuple(entries) if known else None
 
 
 def decode(
@@ -248,8 +242,6 @@ def _layout(tpdo: Tpdo, chosen: dict[Address, MappedObject]) -> TpdoLayout:
         inhibit_s=tpdo.inhibit_100us * 1e-4,
     )
 
-
-FRAME_BITS = 64
 
 # Position and torque first: they must belong to the same instant.
 _ORDER = (

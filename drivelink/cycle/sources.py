@@ -14,6 +14,7 @@ import socket
 import struct
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, Protocol
 
@@ -163,35 +164,21 @@ class VirtualSource(BusSource):
         self._is_open: Callable[[], bool] = lambda: bool(bus._open)
         self._channel: list[queue.Queue[can.Message]] = bus.channel  # of all buses on it
         self._channel_id = bus.channel_id
-        self._pending = bus.queue.queue  # the deque inside: its popleft is atomic, and needs no lock
+        self._pending: deque[can.Message] = bus.queue.queue  # its popleft is atomic, and needs no lock
 
     @property
     def waiting(self) -> bool:
         """Whether a frame is known to be there."""
         return bool(self._pending or self._waiting)
 
-    def wait(self, timeout_s: float) -> bool:
-        """See FrameSource."""
+    def _receive(self, timeout_s: float) -> can.Message | None:
         self._check()
-        if self.waiting:
-            return True
-        if timeout_s <= 0:
-            return False
+        if self._pending:
+            return self._pending.popleft()
         try:
-            self._waiting.append(self._queue.get(timeout=timeout_s))
+            return self._queue.get(timeout=timeout_s) if timeout_s > 0 else None
         except queue.Empty:
-            return False
-        return True
-
-    def take(self) -> list[CanFrame]:
-        """See FrameSource."""
-        if not self.waiting:
-            self._check()
-            return []
-        messages, self._waiting = self._waiting, []
-        while self._pending and len(messages) < MOST_FRAMES:
-            messages.append(self._pending.popleft())
-        return self._frames(messages)
+            return None
 
     def send(self, cob_id: int, data: bytes) -> None:
         """Give every other bus of the channel its own message: python-can would deep-copy."""

@@ -34,7 +34,7 @@ pub enum Signal {
 #[cfg_attr(feature = "python", derive(pyo3::FromPyObject))]
 pub struct MappedObject {
     /// What it means.
-    #[cfg_attr(feature = "python", pyo3(from_py_with = crate::python::signal_of))]
+    #[cfg_attr(feature = "python", pyo3(from_py_with = signal_of))]
     pub signal: Signal,
     /// Its length in the frame, at most 64 for a signal that is used.
     pub bits: u32,
@@ -75,6 +75,26 @@ impl Signal {
                 | Signal::PositionDemand
         )
     }
+}
+
+/// What a mapped object of Python means.
+#[cfg(feature = "python")]
+fn signal_of(object: &pyo3::Bound<'_, pyo3::PyAny>) -> pyo3::PyResult<Signal> {
+    use pyo3::types::PyAnyMethods;
+    Ok(match object.extract::<String>()?.as_str() {
+        "motor_position" => Signal::MotorPosition,
+        "motor_velocity" => Signal::MotorVelocity,
+        "motor_torque" => Signal::MotorTorque,
+        "statusword" => Signal::Statusword,
+        "link_position" => Signal::LinkPosition,
+        "link_velocity" => Signal::LinkVelocity,
+        "velocity_check" => Signal::VelocityCheck,
+        "torque_check" => Signal::TorqueCheck,
+        "second_position" => Signal::SecondPosition,
+        "following_error" => Signal::FollowingError,
+        "position_demand" => Signal::PositionDemand,
+        _ => Signal::Other,
+    })
 }
 
 /// One TPDO: its identifier and the objects in it, in order from bit 0.

@@ -7,7 +7,6 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
-use crate::layout::Signal;
 use crate::wire;
 
 pub(super) fn drive_error(py: Python<'_>, message: String) -> PyErr {
@@ -101,22 +100,4 @@ pub(super) fn encode_external<'py>(
 ) -> PyResult<Bound<'py, PyBytes>> {
     let external = external_of(external.extract()?);
     Ok(PyBytes::new(py, wire::encode_external(&external, stamp_ns).bytes()))
-}
-
-/// What a mapped object of Python means.
-pub(crate) fn signal_of(object: &Bound<'_, PyAny>) -> PyResult<Signal> {
-    Ok(match object.extract::<String>()?.as_str() {
-        "motor_position" => Signal::MotorPosition,
-        "motor_velocity" => Signal::MotorVelocity,
-        "motor_torque" => Signal::MotorTorque,
-        "statusword" => Signal::Statusword,
-        "link_position" => Signal::LinkPosition,
-        "link_velocity" => Signal::LinkVelocity,
-        "velocity_check" => Signal::VelocityCheck,
-        "torque_check" => Signal::TorqueCheck,
-        "second_position" => Signal::SecondPosition,
-        "following_error" => Signal::FollowingError,
-        "position_demand" => Signal::PositionDemand,
-        _ => Signal::Other,
-    })
 }

@@ -12,8 +12,7 @@ are 1e-3 of theirs, so that all numbers go over by the same factor.
 | g(q) | 0.025 sin q N·m | 0.2943 sin q N·m, assumed |
 | torque | 0.01 sin 0.1πt N·m | 0.1 sin 0.1πt, 0.1 sin 0.2πt N·m, assumed |
 
-Each case's `assumed` lists assumptions and reasons. Drives, gears and encoders are assumed in every case: the
-paper states none.
+Drives, gears and encoders are assumed in every case: the paper states none. Reasons stand beside the values.
 """
 
 from __future__ import annotations
@@ -30,15 +29,6 @@ from sim.sensors import RPM_RAD_S, DriveHardware, LinkEncoder
 from sim.world import World
 
 
-@dataclass(frozen=True, slots=True)
-class Assumption:
-    """A value that the paper does not give."""
-
-    quantity: str
-    value: str  # with its unit
-    reason: str  # why this one
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
     """A named case."""
@@ -49,22 +39,18 @@ class Case:
     encoder: LinkEncoder  # at the link
     excitation: Mapping[str, Any]  # the paper's torque, as a table for `sim.excitation.build`
     rich: Mapping[str, Any]  # a richer torque for the same joint
-    assumed: tuple[Assumption, ...]  # values that the paper does not state
 
     def world(
         self,
         *,
         excitation: Mapping[str, Any] | None = None,
         effects: Sequence[PlantEffect] = (),
-        period_s: float = 0.001,
-        plant_step_s: float | None = None,
         seed: int = 0,
     ) -> World:
         """Return the case at rest.
 
         Args:
             excitation: a table in place of the paper's.
-            plant_step_s: integration step; None: chosen.
         """
         return World(
             self.plant,
@@ -72,48 +58,31 @@ class Case:
             self.encoder,
             excitation=build(self.excitation if excitation is None else excitation, len(self.drives)),
             effects=effects,
-            period_s=period_s,
-            plant_step_s=plant_step_s,
             seed=seed,
         )
 
 
-_SENSORS = (
-    Assumption("link encoder", "18 bit", "a usual absolute encoder"),
-    Assumption("velocity", "0.001 rpm at the motor shaft", "the finest unit that usual CiA 402 drives offer"),
-    Assumption("current noise", "0.2 % of the rated current", "between the 0.1 and 0.5 % of real drives"),
-)
-_FINE_RAD_S = 0.001 * RPM_RAD_S
-_PAPER_ASSUMED = (
-    Assumption("gear", "20", "the paper's quantities are at the joint already"),
-    Assumption(
-        "torque constant, rated current", "0.005 N·m/A, 0.2 A", "rated 0.02 N·m at the joint: twice the peak"
-    ),
-    Assumption(
-        "motor encoder",
-        "17 bit",
-        "B is large against the torque (0.2 rad/s² at most): a coarser encoder would drown the acceleration",
-    ),
-    *_SENSORS,
-)
+_ENCODER = LinkEncoder()  # 18 bit, a usual absolute encoder
+_FINE_RAD_S = 0.001 * RPM_RAD_S  # of the velocity: the finest unit that usual CiA 402 drives offer
 
 
 def _paper_joint(name: str, spring: Spring) -> Case:
     motor = MotorPlant(inertia_kg_m2=0.05, viscous_damping_nm_s_rad=0.001, spring=spring)
     link = LinkPlant(inertia_kg_m2=0.1, viscous_damping_nm_s_rad=0.0001, gravity_nm=0.025)
     drive = DriveHardware(
+        # 17 bit: B is large against the torque (0.2 rad/s² at most), a coarser one hides the acceleration
         counts_per_rev=131072.0,
-        gear_ratio=20.0,
-        torque_constant_nm_a=0.005,
+        gear_ratio=20.0,  # any: the paper's quantities are at the joint already
+        torque_constant_nm_a=0.005,  # with the current: rated 0.02 N·m at the joint, twice the peak
         rated_current_a=0.2,
-        current_noise_a=0.0004,
+        current_noise_a=0.0004,  # 0.2 % of the rated current, between the 0.1 and 0.5 % of real drives
         velocity_resolution_rad_s=_FINE_RAD_S,
     )
     return Case(
         name=name,
         plant=JointPlant(arrangement="single", motors=(motor,), link=link),
         drives=(drive,),
-        encoder=LinkEncoder(),
+        encoder=_ENCODER,
         excitation={"kind": "sines", "amplitude_nm": 0.01, "frequency_hz": 0.05},
         rich={
             "kind": "rich",
@@ -123,7 +92,6 @@ def _paper_joint(name: str, spring: Spring) -> Case:
             "centring_nm_rad": 0.02,
             "centring_nm_s_rad": 0.03,
         },
-        assumed=_PAPER_ASSUMED,
     )
 
 
@@ -141,12 +109,14 @@ def _quadratic() -> Case:
 def _vsa_ii() -> Case:
     """Section V-C, eqs 19, 20."""
     spring = Spring(model="vsa-ii", parameters={"k_nm_rad": 0.5, "c": 1.75})
+    # a rotor of 12.5 g·cm² behind a gear of 20; damping about 0.3 of critical at the motors
     motor = MotorPlant(inertia_kg_m2=0.0005, viscous_damping_nm_s_rad=0.005, spring=spring)
+    # 0.3 kg at 0.1 m: it stays below 45°
     link = LinkPlant(inertia_kg_m2=0.003, viscous_damping_nm_s_rad=0.001, gravity_nm=0.2943)
     drive = DriveHardware(
-        counts_per_rev=16384.0,
+        counts_per_rev=16384.0,  # 4096 lines, a usual encoder
         gear_ratio=20.0,
-        torque_constant_nm_a=0.02,
+        torque_constant_nm_a=0.02,  # with the current: rated 0.2 N·m at the joint
         rated_current_a=0.5,
         current_noise_a=0.001,
         velocity_resolution_rad_s=_FINE_RAD_S,
@@ -155,7 +125,9 @@ def _vsa_ii() -> Case:
         name="vsa-ii",
         plant=JointPlant(arrangement="antagonistic", motors=(motor, motor), link=link),
         drives=(drive, drive),
-        encoder=LinkEncoder(),
+        encoder=_ENCODER,
+        # The printed torques lack t, and 10 N·mm does not reach the deflections that the printed polynomials
+        # were fitted on; 100 N·mm does.
         excitation={"kind": "sines", "amplitude_nm": 0.1, "frequency_hz": [0.05, 0.1]},
         rich={
             "kind": "rich",
@@ -165,20 +137,6 @@ def _vsa_ii() -> Case:
             "centring_nm_rad": 0.1,
             "centring_nm_s_rad": 0.005,
         },
-        assumed=(
-            Assumption(
-                "torque",
-                "0.1 sin 0.1πt and 0.1 sin 0.2πt N·m",
-                "the printed torques lack t, and 10 N·mm does not reach the deflections that the printed "
-                "polynomials were fitted on; 100 N·mm does",
-            ),
-            Assumption("link", "M = 0.003 kg·m², gravity 0.2943 N·m", "0.3 kg at 0.1 m: it stays below 45°"),
-            Assumption("motors", "B = 0.0005 kg·m²", "a rotor of 12.5 g·cm² behind a gear of 20"),
-            Assumption("damping", "0.005 and 0.001 N·m·s/rad", "about 0.3 of critical at the motors"),
-            Assumption("torque constant, rated current", "0.02 N·m/A, 0.5 A", "rated 0.2 N·m at the joint"),
-            Assumption("motor encoder", "16384 counts per motor revolution", "4096 lines, a usual one"),
-            *_SENSORS,
-        ),
     )
 
 

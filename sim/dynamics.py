@@ -107,7 +107,7 @@ def _motor_load(motor: MotorPlant) -> Load:
     return _load(motor.viscous_damping_nm_s_rad, motor.terms.loads)
 
 
-def _load(damping: float, loads: tuple[Load, ...]) -> Load:
+def _load(damping: float, loads: list[Load]) -> Load:
     def load(position: float, velocity: float) -> float:
         total = damping * velocity
         for x in loads:

@@ -161,13 +161,13 @@ def _braked(velocity: float, most: float) -> float:
     return velocity + most if velocity < -most else 0.0
 
 
-def _dry_bodies(plant: JointPlant, step_s: float) -> list[tuple[int, int | None, tuple[Dry, ...], float]]:
+def _dry_bodies(plant: JointPlant, step_s: float) -> list[tuple[int, int | None, list[Dry], float]]:
     """Bodies with friction: (index of position, motor or None for the link, levels, step over inertia)."""
     link = plant.link
     if plant.rigid:
         motor = plant.motors[0]
         inertia = motor.inertia_kg_m2 + link.inertia_kg_m2
-        found: list[tuple[int, int | None, tuple[Dry, ...], float]] = [
+        found: list[tuple[int, int | None, list[Dry], float]] = [
             (2, 0, motor.terms.dry + link.terms.dry, step_s / inertia)
         ]
     else:

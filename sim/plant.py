@@ -183,15 +183,18 @@ Commit = Callable[[float, float], None]
 """Called with theta and the deflection of the spring at the end of each step."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class Terms:
     """Terms that effects add to one body."""
 
-    loads: tuple[Load, ...] = ()  # x(position, velocity), N·m
-    dry: tuple[Dry, ...] = ()  # levels of dry friction, N·m
-    extras: tuple[Extra, ...] = ()  # of a motor's transmission, added to tau_e on both sides
-    kinematics: tuple[Kinematics, ...] = ()  # of a motor's gear
-    commits: tuple[Commit, ...] = ()  # memories to update at each step
+    loads: list[Load] = field(default_factory=list)  # x(position, velocity), N·m
+    dry: list[Dry] = field(default_factory=list)  # levels of dry friction, N·m
+    extras: list[Extra] = field(
+        default_factory=list
+    )  # of a motor's transmission, added to tau_e on both sides
+    kinematics: list[Kinematics] = field(default_factory=list)  # of a motor's gear
+    commits: list[Commit] = field(default_factory=list)  # memories to update at each step
+    reshape: list[Callable[[Law], Law]] = field(default_factory=list)  # of a motor's spring, applied in order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,8 +204,7 @@ class MotorPlant:
     inertia_kg_m2: float  # B > 0
     viscous_damping_nm_s_rad: float = 0.0  # D_theta >= 0
     spring: Spring  # tau_e(phi); rigid: motor and link are one body
-    reshape: tuple[Callable[[Law], Law], ...] = ()  # changes of the spring's law by effects, applied in order
-    terms: Terms = Terms()  # further physics
+    terms: Terms = field(default_factory=Terms)  # further physics
 
     def __post_init__(self) -> None:
         _check("motor", self.inertia_kg_m2, self.viscous_damping_nm_s_rad)
@@ -210,7 +212,7 @@ class MotorPlant:
     def law(self) -> Law:
         """Return the elastic law including effects."""
         law = self.spring.law()
-        for reshape in self.reshape:
+        for reshape in self.terms.reshape:
             law = reshape(law)
         return law
 
@@ -223,7 +225,7 @@ class LinkPlant:
     viscous_damping_nm_s_rad: float = 0.0  # D_q >= 0
     gravity_nm: float = 0.0  # amplitude of gravity
     gravity_phase_rad: float = 0.0  # angle added to q
-    terms: Terms = Terms()  # further physics
+    terms: Terms = field(default_factory=Terms)  # further physics
 
     def __post_init__(self) -> None:
         _check("link", self.inertia_kg_m2, self.viscous_damping_nm_s_rad)

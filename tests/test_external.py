@@ -158,7 +158,8 @@ def test_what_a_late_sync_does_to_the_positions_is_no_contact_and_pushes_are_fou
     read = {
         name: CubicSpline(t, pushed[name])(t + late) for name in ("motor1_position_rad", "link_position_rad")
     }
-    contact = {}
+    free, after = slice(LEARNED, round(PUSHES[0][0] / T)), [round((begin + PUSH_S) / T) for begin, _ in PUSHES]
+    contact, most = {}, {}
     for told in (False, True):
         estimator = make_estimator(model(), EstimatorSettings(contact_torque_nm=0.2), T)
         pipeline = JointPipeline(Assembler((), 0), estimator)
@@ -168,8 +169,10 @@ def test_what_a_late_sync_does_to_the_positions_is_no_contact_and_pushes_are_fou
             for sample, ns in zip(samples(pushed | read), late_ns, strict=True)
         ]
         contact[told] = np.array([one.status & CONTACT > 0 for one in external])
-    free, after = slice(0, round(PUSHES[0][0] / T)), [round((begin + PUSH_S) / T) for begin, _ in PUSHES]
-    assert contact[False][free].any() and not contact[True][free].any()
+        valid = [one for one in external[free] if one.status & VALID]
+        most[told] = max(abs(one.external_torque_nm) / one.external_torque_std_nm for one in valid)
+    assert most[True] < 1.96 < most[False]
+    assert not contact[True][: free.stop].any()
     assert all(contact[True][end - round(PUSH_S / T) : end].any() for end in after)
 
 

@@ -203,13 +203,14 @@ impl Blocks {
         self.unexplained = if self.posterior.is_some() { 0.0 } else { f64::NAN };
     }
 
-    /// What follows is not as what was before: half a block is a block, but for what a restart is judged by.
+    /// What follows is not of the same moments: half a block is a block, fewer rows wait for more. A restart is judged
+    /// by what follows it alone.
     pub fn cut(&mut self) {
-        if self.open.rows >= 0.5 * self.rows && self.ring.len() >= FEWEST && !self.suspected {
+        if self.suspected {
+            self.open = Gram::default();
+        } else if self.open.rows >= 0.5 * self.rows {
             let block = std::mem::take(&mut self.open);
             self.close(block);
-        } else {
-            self.open = Gram::default();
         }
         self.quick = 0.0;
     }
@@ -238,10 +239,11 @@ impl Blocks {
         self.lost
     }
 
-    /// Whether a lost zero has been found by fewer blocks than an interval needs.
+    /// Whether fewer blocks than an interval needs are all that tells of the spring, or of a lost zero.
     #[must_use]
     pub fn is_unconfirmed(&self) -> bool {
-        self.lost && self.ring.len() < FEWEST && !self.spring.is_constant()
+        let nothing_before = self.carried.is_none() && !self.spring.is_anchored();
+        self.ring.len() < FEWEST && (nothing_before || self.lost && !self.spring.is_constant())
     }
 
     /// Whether nothing has been learned, and no zero has been lost.

@@ -153,6 +153,12 @@ impl Spring {
         self.anchored = false;
     }
 
+    /// Whether the file says about what it is.
+    #[must_use]
+    pub fn is_anchored(&self) -> bool {
+        self.anchored
+    }
+
     /// α of this law alone.
     #[must_use]
     pub fn parameters(&self) -> &[f64] {

@@ -271,12 +271,12 @@ impl Blocks {
         let left_out = groups.iter().filter(|group| *group & !chosen.set & frame.set != 0);
         let rivals = left_out.map(|group| (chosen.set | group, prior)).chain([(chosen.set, &elsewhere)]);
         for (set, prior) in rivals {
-            let Some(other) = solve(reduced, set, prior, noise) else { continue };
-            let odds = (other.log_evidence - chosen.log_evidence).exp() / many;
+            let odds = (log_evidence(reduced, set, prior, noise) - chosen.log_evidence).exp() / many;
             let probability = odds / (1.0 + odds);
             if probability < UNLIKELY {
                 continue;
             }
+            let Some(other) = solve(reduced, set, prior, noise) else { continue };
             for i in unknowns(chosen.set) {
                 for j in unknowns(chosen.set) {
                     let moved = (other.x[i] - chosen.x[i]) * (other.x[j] - chosen.x[j]);

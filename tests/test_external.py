@@ -158,7 +158,10 @@ def test_what_a_late_sync_does_to_the_positions_is_no_contact_and_pushes_are_fou
     read = {
         name: CubicSpline(t, pushed[name])(t + late) for name in ("motor1_position_rad", "link_position_rad")
     }
-    free, after = slice(LEARNED, round(PUSHES[0][0] / T)), [round((begin + PUSH_S) / T) for begin, _ in PUSHES]
+    free, after = (
+        slice(LEARNED, round(PUSHES[0][0] / T)),
+        [round((begin + PUSH_S) / T) for begin, _ in PUSHES],
+    )
     contact, most = {}, {}
     for told in (False, True):
         estimator = make_estimator(model(), EstimatorSettings(contact_torque_nm=0.2), T)

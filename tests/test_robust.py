@@ -229,7 +229,7 @@ def test_serial_takes_the_first_transmission_and_asks_for_a_rigid_second():
 # What is called valid is right, whatever reaches the estimator: gaps, garbage, glitches, any joint.
 
 
-SPOILT_SAMPLES = 15_000  # samples: filters settle after each fault, so what is learned of comes to two seconds in ten
+SPOILT_SAMPLES = 15_000  # filters settle after each fault: what is learned from comes to two seconds in ten
 
 
 @lru_cache(maxsize=2)

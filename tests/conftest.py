@@ -6,6 +6,10 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+import zenohkit
+
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.session import close_session, open_session
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does
 
@@ -34,6 +38,29 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.stem in REAL_TIME:
             item.add_marker(pytest.mark.real_time)
+
+
+@pytest.fixture
+def endpoint():
+    return zenohkit.free_endpoint()
+
+
+@pytest.fixture
+def publisher(endpoint):
+    """The keys of the joint elbow."""
+    joint = zenohkit.make_joint("elbow", endpoint)
+    session = open_session(joint.zenoh, Path())
+    yield JointPublisher(session, joint)
+    close_session(session)
+
+
+@pytest.fixture(scope="module")
+def daemon():
+    """The endpoint of a daemon of the joint elbow, in a process of its own."""
+    endpoint = zenohkit.free_endpoint()
+    with zenohkit.script("elbow", endpoint) as process:
+        zenohkit.ready(process)
+        yield endpoint
 
 
 @pytest.hookimpl(optionalhook=True)

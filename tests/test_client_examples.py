@@ -8,20 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from zenohkit import free_endpoint, make_estimate, make_external, ready, script
+from zenohkit import make_estimate, make_external
 
 from drivelink._core import encode_estimate, encode_external
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
-
-
-@pytest.fixture
-def endpoint():
-    endpoint = free_endpoint()
-    with script("elbow", endpoint) as daemon:
-        ready(daemon)
-        yield endpoint
 
 
 def run(*command, **options):
@@ -41,9 +33,9 @@ def run(*command, **options):
         ("subscribe_numpy.py", "stiffness 700.0 N·m/rad", "0.5"),
     ],
 )
-def test_the_python_examples_run(endpoint, name, expected, more):
+def test_the_python_examples_run(daemon, name, expected, more):
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
-    command = [sys.executable, str(EXAMPLES / name), "elbow", endpoint, more]
+    command = [sys.executable, str(EXAMPLES / name), "elbow", daemon, more]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         try:
             assert any(re.search(expected, line) for line in process.stdout)
@@ -53,7 +45,7 @@ def test_the_python_examples_run(endpoint, name, expected, more):
 
 @pytest.mark.rust
 @pytest.mark.timeout(1200)
-def test_the_rust_example_reads_the_golden_vectors_and_the_daemon(endpoint):
+def test_the_rust_example_reads_the_golden_vectors_and_the_daemon(daemon):
     if shutil.which("cargo") is None:
         pytest.skip("no cargo on this machine")
     target = Path(os.environ.get("CARGO_TARGET_DIR", EXAMPLES / "rust" / "target"))
@@ -61,7 +53,7 @@ def test_the_rust_example_reads_the_golden_vectors_and_the_daemon(endpoint):
         pytest.skip("builds for minutes: set CARGO_TARGET_DIR, or run cargo build in examples/rust once")
     run("cargo", "test", "--locked", "--quiet", cwd=EXAMPLES / "rust")
     run("cargo", "build", "--locked", "--quiet", cwd=EXAMPLES / "rust")
-    out = run(target / "debug" / "drivelink-subscribe", "elbow", endpoint, "20", timeout=60)
+    out = run(target / "debug" / "drivelink-subscribe", "elbow", daemon, "20", timeout=60)
     assert out.count("700.0 ± 3.0 N·m/rad, valid true, observable true") == 20
 
 
@@ -80,10 +72,10 @@ def test_the_cpp_decoder_reads_the_golden_vectors(cpp):
     assert "12 vectors, 39 to be refused, 0 wrong" in printed
 
 
-def test_the_cpp_example_reads_the_daemon(cpp, endpoint):
+def test_the_cpp_example_reads_the_daemon(cpp, daemon):
     if not (cpp / "subscribe").exists():
         pytest.skip("zenoh-pico is not installed (CMAKE_PREFIX_PATH)")
-    out = run(cpp / "subscribe", "elbow", endpoint, "20", timeout=60)
+    out = run(cpp / "subscribe", "elbow", daemon, "20", timeout=60)
     assert out.count("700.0 ± 3.0 N·m/rad, valid 1, observable 1") == 20
 
 

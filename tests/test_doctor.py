@@ -1,6 +1,5 @@
 import itertools
 import json
-import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from canopenkit import Item, Slave, Wire, drive_objects, eds_text
 from rich.console import Console
+from zenohkit import free_endpoint
 
 from drivelink.canopen.bus import run_program
 from drivelink.canopen.guard import check_frame
@@ -30,11 +30,6 @@ from estimator.sample import Record
 REPOSITORY = Path(__file__).parents[1]
 CHANNELS = itertools.count()
 OURS = sorted((REPOSITORY / "sim/eds").glob("*.eds"))
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
 
 
 def joint_on(channel, extra="", encoder=""):
@@ -61,7 +56,7 @@ inertia_kg_m2 = 0.2
 channel = "{channel}"
 sdo_timeout_s = 0.3
 [zenoh]
-endpoint = "tcp/127.0.0.1:{free_port()}"
+endpoint = "{free_endpoint()}"
 """
 
 

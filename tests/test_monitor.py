@@ -20,7 +20,7 @@ from rich.console import Console
 from drivelink import cli
 from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
-from drivelink.monitor.statuslines import shape, status_lines, status_text
+from drivelink.monitor.statuslines import shape, status_lines
 from drivelink.monitor.terminal import joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.watcher import Watcher
@@ -202,21 +202,7 @@ def test_sparkline_and_plot_take_anything_and_are_never_wider_than_their_room():
         assert max(map(len, plot.render("torque over time, N·m", "rad").plain.split("\n"))) == 37
 
 
-def test_a_status_of_another_version_is_shown_as_far_as_it_goes():
-    assert status_text({}) == "" and status_lines({}, 80) == []
-    odd = {"state": 3, "latency": None, "nodes": {"1": "up"}, "rate_hz": "fast", "conditions": None}
-    assert all(len(line.plain) <= 80 for line in status_lines(odd, 80))
-
-
 # Between processes
-
-
-@pytest.fixture(scope="module")
-def daemon():
-    endpoint = zenohkit.free_endpoint()
-    with zenohkit.script("elbow", endpoint) as process:
-        zenohkit.ready(process)
-        yield endpoint
 
 
 def test_the_watcher_finds_joints_and_notes_when_they_are_gone():

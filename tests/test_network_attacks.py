@@ -11,7 +11,7 @@ from struct import pack
 import pytest
 import zenoh
 from rich.console import Console
-from zenohkit import free_endpoint, make_estimate, make_joint, make_sample, put_estimate, put_sample, until
+from zenohkit import make_estimate, make_joint, make_sample, put_estimate, put_sample, until
 
 import drivelink
 from drivelink._core import encode_estimate, encode_sample
@@ -23,7 +23,7 @@ from drivelink.monitor.watcher import MAX_JOINTS, Watcher
 from drivelink.monitor.web import snapshot
 from drivelink.pubsub import feed
 from drivelink.pubsub.feed import MAX_CLAIMS, DaemonIdentity
-from drivelink.pubsub.publisher import JointPublisher, to_json
+from drivelink.pubsub.publisher import to_json
 from drivelink.pubsub.session import close_session, daemon_config, open_client, open_session
 from drivelink.recording.formats import open_sink
 from drivelink.recording.recorder import ZenohTap
@@ -52,6 +52,8 @@ DOCUMENTS = {
     ).encode(),
     "too many": json.dumps({"a": [0] * 30_000}).encode(),
     "too large": b'{"a": "' + b"x" * (1 << 20) + b'"}',
+    "nothing": b"{}",
+    "another version": b'{"nodes": {"1": "up"}, "latency": null, "rate_hz": "fast", "conditions": null}',
     "booleans": b'{"rate_hz": true, "missed_cycles": false, "residual_nm": true}',
 }
 
@@ -85,19 +87,6 @@ def rogue(endpoint):
         yield session
     finally:
         session.close()
-
-
-@pytest.fixture
-def endpoint():
-    return free_endpoint()
-
-
-@pytest.fixture
-def publisher(endpoint):
-    joint = make_joint("elbow", endpoint)
-    session = open_session(joint.zenoh, Path())
-    yield JointPublisher(session, joint)
-    close_session(session)
 
 
 def publish(publisher, sequence=[0]):  # noqa: B006  (counts through the test)

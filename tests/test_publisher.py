@@ -5,7 +5,6 @@ import json
 import math
 import signal
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ import zenoh.ext
 from zenohkit import (
     LIMIT_S,
     Cycle,
-    free_endpoint,
     make_estimate,
     make_external,
     make_joint,
@@ -27,26 +25,14 @@ from zenohkit import (
 
 from drivelink._core import encode_estimate, encode_external, encode_sample
 from drivelink.pubsub import wire
-from drivelink.pubsub.publisher import _QUERIES, JointPublisher, describe_model, schema, to_json
-from drivelink.pubsub.session import close_session, open_client, open_session
+from drivelink.pubsub.publisher import _QUERIES, describe_model, schema, to_json
+from drivelink.pubsub.session import close_session, open_client
 from estimator.sample import Status
-
-
-@pytest.fixture
-def endpoint():
-    return free_endpoint()
 
 
 @pytest.fixture
 def joint(endpoint):
     return make_joint("elbow", endpoint)
-
-
-@pytest.fixture
-def publisher(joint):
-    session = open_session(joint.zenoh, Path())
-    yield JointPublisher(session, joint)
-    close_session(session)
 
 
 @pytest.fixture

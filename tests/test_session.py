@@ -10,17 +10,12 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from zenohkit import LIMIT_S, free_endpoint, make_joint, ready, script, until
+from zenohkit import LIMIT_S, make_joint, ready, script, until
 
 from drivelink.errors import ZenohError
 from drivelink.jointfile import ZenohSection
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import FILES, close_session, daemon_config, open_client, open_session
-
-
-@pytest.fixture
-def endpoint():
-    return free_endpoint()
 
 
 @pytest.fixture

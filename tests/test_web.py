@@ -17,14 +17,6 @@ from drivelink.monitor.webserver import MAX_CONNECTIONS
 from drivelink.pubsub.session import close_session, open_client
 
 
-@pytest.fixture(scope="module")
-def daemon():
-    endpoint = zenohkit.free_endpoint()
-    with zenohkit.script("elbow", endpoint) as process:
-        zenohkit.ready(process)
-        yield endpoint
-
-
 def get(url, host=None):
     request = urllib.request.Request(url, headers={"Host": host} if host else {})
     try:

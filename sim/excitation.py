@@ -92,14 +92,11 @@ class _Keys:
             raise SimError(f"{self._where}.{next(iter(self._left))}: unknown key")
 
 
-def build(
-    table: Mapping[str, Any], motors: int, amplitude_nm: float | None = None, where: str = "excitation"
-) -> Excitation:
+def build(table: Mapping[str, Any], motors: int, where: str = "excitation") -> Excitation:
     """Make an excitation from a table as it stands in a joint file.
 
     Args:
         table: `kind` and its keys (see `docs/reference/simulation.md`); an empty table is "rich".
-        amplitude_nm: default of the key of that name; None: the key is required.
 
     Raises:
         SimError: unknown, missing or impossible key.
@@ -110,7 +107,7 @@ def build(
     if kind == "motion":
         profiles, moved = _played(keys, motors, where)
     else:
-        profiles = _profiles(keys, kind, motors, amplitude_nm)
+        profiles = _profiles(keys, kind, motors)
     external = keys.table("external")
     excitation = Excitation(
         profiles=profiles,
@@ -126,7 +123,7 @@ def build(
 
 def _external(table: Mapping[str, Any], where: str) -> Profile:
     keys = _Keys(table, where)
-    (profile,) = _profiles(keys, keys.text("kind", "rich", tuple(KINDS)), 1, None)
+    (profile,) = _profiles(keys, keys.text("kind", "rich", tuple(KINDS)), 1)
     keys.finish()
     return profile
 
@@ -158,8 +155,8 @@ def _played(
     return tuple(torque), tuple(zip(position, velocity, strict=True))
 
 
-def _profiles(keys: _Keys, kind: str, motors: int, amplitude_nm: float | None) -> tuple[Profile, ...]:
-    amplitudes = keys.each("amplitude_nm", 0.0 if kind == "none" else amplitude_nm, motors)
+def _profiles(keys: _Keys, kind: str, motors: int) -> tuple[Profile, ...]:
+    amplitudes = keys.each("amplitude_nm", 0.0 if kind == "none" else None, motors)
     offsets = keys.each("offset_nm", 0.0, motors)
     ramp_s = keys.number("ramp_s", 0.0, 0.0)
     shapes = KINDS[kind](keys, motors)

@@ -19,9 +19,11 @@ from estimator.sample import Sample, Status
 from estimator.transmissions import MODELS
 
 _BINS = 160
+_SECONDS, _KEPT = 12.0, 600  # of the history, and its points
 _USABLE = int(Status.VALID | Status.OBSERVABLE)
 _NEAR = 8  # neighbouring points on either side for the outlier test
 _GAP_S = 0.25  # without a moment: a gap in the curves
+_OUTERMOST = 0.02  # fraction of the values, both ends together, that sets no range
 _OUTDATED = 2.5  # times the usual one there
 
 
@@ -99,22 +101,22 @@ class GrowingCurve:
 class JointHistory:
     """The last seconds of a joint and its curve."""
 
-    def __init__(self, seconds: float = 12.0, points: int = 600) -> None:
-        self.seconds = seconds
-        self.moments: deque[Moment] = deque(maxlen=points)  # thinned estimates, oldest first
+    def __init__(self) -> None:
+        self.seconds = _SECONDS
+        self.moments: deque[Moment] = deque(maxlen=_KEPT)  # thinned estimates, oldest first
         # stiffness over deflection of each transmission, where it is usable
         self.curves: tuple[GrowingCurve, ...] = ()
         # the same since the estimate stopped being usable; empty while it is
         self.doubtful: tuple[GrowingCurve, ...] = ()
         # (time of the newest estimate, s; largest residual over its baseline)
-        self.residuals: deque[tuple[float, float]] = deque(maxlen=points)
+        self.residuals: deque[tuple[float, float]] = deque(maxlen=_KEPT)
         # thinned external torques, oldest first; empty without link dynamics
-        self.touches: deque[Touch] = deque(maxlen=points)
+        self.touches: deque[Touch] = deque(maxlen=_KEPT)
         self.touch: Touch | None = None  # the newest one
         # thinned (time, s; sample), oldest first; empty while nobody asks for them
-        self.signals: deque[tuple[float, Sample]] = deque(maxlen=points)
+        self.signals: deque[tuple[float, Sample]] = deque(maxlen=_KEPT)
         self.latest: EstimateMessage | None = None  # the newest estimate
-        self._apart_s = seconds / points
+        self._apart_s = _SECONDS / _KEPT
 
     def add(self, estimate: EstimateMessage, time_s: float, truth: TruePoint | None = None) -> None:
         """Enter one estimate; `time_s` is the time of its SYNC, with any origin."""
@@ -209,11 +211,8 @@ class JointHistory:
         )
 
 
-def usual_range(values: Sequence[float], most: float = 0.02) -> tuple[float, float]:
+def usual_range(values: Sequence[float]) -> tuple[float, float]:
     """Return the range of a plot: that of all but the outermost values, extended to those by at most half.
-
-    Args:
-        most: fraction of outermost values, both ends together.
 
     Returns:
         (low, high); (nan, nan) where there is nothing finite.
@@ -221,7 +220,7 @@ def usual_range(values: Sequence[float], most: float = 0.02) -> tuple[float, flo
     known = sorted(value for value in values if math.isfinite(value))
     if not known:
         return math.nan, math.nan
-    out = math.ceil(most / 2 * len(known)) if len(known) > 4 else 0
+    out = math.ceil(_OUTERMOST / 2 * len(known)) if len(known) > 4 else 0
     low, high = known[out], known[-1 - out]
     reach = 0.5 * (high - low)
     low, high = max(known[0], low - reach), min(known[-1], high + reach)

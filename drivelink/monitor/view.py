@@ -70,13 +70,11 @@ class JointView:
         height: lines; default: those of the terminal.
     """
 
-    def __init__(
-        self, name: str, *, subtitle: str = "", seconds: float = 12.0, height: int | None = None
-    ) -> None:
+    def __init__(self, name: str, *, subtitle: str = "", height: int | None = None) -> None:
         self.name = name
         self.subtitle = subtitle
         self.footer = ""  # the last line, e.g. how to quit.
-        self.history = JointHistory(seconds)  # data of the view
+        self.history = JointHistory()  # data of the view
         self._status: Mapping[str, Any] = {}
         self.model: Mapping[str, Any] = {}  # the model document, or empty
         self.finding: Mapping[str, Any] = {}  # the newest finding, or empty

@@ -25,7 +25,7 @@ MODEL_ALARM_ADVICE = (
 _SHORT_ADVICE = "model alarm: do not control on it; drivelink diagnose says why"
 _MOST = 16  # entries of a list that a view shows
 _WORDS = 200  # characters of one entry
-_GAUGE = 10  # characters
+_GAUGE, _LABEL = 10, 11  # characters
 _FULL = 2.0  # times its baseline where a gauge is full
 
 
@@ -231,58 +231,46 @@ def status_lines(
     """Return seven lines at most: cycle, nodes, residual, why not valid, advice, problems, the finding."""
     if not status:
         return []
-    shown = shape(status, model)
-    lines = [_line("cycle", _cycle(shown), width), _nodes(shown, width), _gauges(shown, width)]
-    lines.append(_line("not valid", shown.not_valid, width, "red"))
-    if shown.alarm:
-        advice = shown.advice if len(shown.advice) + 11 <= width else _SHORT_ADVICE
-        lines.append(_line("look here", advice, width, "bold red"))
-    lines.append(_line("look here", "; ".join(shown.wrong), width, "bold red"))
-    lines.append(_line("finding", _text(findings.line(finding or {})), width, "bold"))
-    return [line for line in lines if line is not None]
+    shown, found = shape(status, model), _text(findings.line(finding or {}))
+    advice = shown.advice if len(shown.advice) + _LABEL <= width else _SHORT_ADVICE
+    rows: list[tuple[str, list[tuple[str, str]]]] = [
+        ("cycle", [(_cycle(shown), "")]),
+        ("nodes", _nodes(shown)),
+        ("residual", _gauges(shown)),
+        ("not valid", [(shown.not_valid, "red")]),
+        ("look here", [(advice if shown.alarm else "", "bold red")]),
+        ("look here", [("; ".join(shown.wrong), "bold red")]),
+        ("finding", [(found, "bold")]),
+    ]
+    lines = []
+    for label, parts in rows:
+        if any(text for text, _ in parts):
+            line = Text.assemble((f"{label:<{_LABEL}}", "dim"), *parts, no_wrap=True)
+            line.truncate(width, overflow="ellipsis")
+            lines.append(line)
+    return lines
 
 
-def _line(label: str, text: str, width: int, style: str = "") -> Text | None:
-    if not text:
-        return None
-    line = Text(no_wrap=True)
-    line.append(f"{label:<11}", style="dim")
-    line.append(text, style=style)
-    line.truncate(width, overflow="ellipsis")
-    return line
-
-
-def _nodes(shown: Shown, width: int) -> Text | None:
-    if not shown.nodes:
-        return None
-    line = Text(no_wrap=True)
-    line.append(f"{'nodes':<11}", style="dim")
+def _nodes(shown: Shown) -> list[tuple[str, str]]:
+    parts = []
     for node in shown.nodes:
-        line.append(f"{node.id} ", style="bold")
-        line.append(f"{node.text}  ", style="green" if node.good else "bold red")
-    if shown.load:
-        line.append(f"bus {shown.load}  ", style="dim")
-    line.append(_cpu(shown), style="dim")
-    line.truncate(width, overflow="ellipsis")
-    return line
+        parts += [(f"{node.id} ", "bold"), (f"{node.text}  ", "green" if node.good else "bold red")]
+    if parts:
+        parts += [(f"bus {shown.load}  " if shown.load else "", "dim"), (_cpu(shown), "dim")]
+    return parts
 
 
-def _gauges(shown: Shown, width: int) -> Text | None:
+def _gauges(shown: Shown) -> list[tuple[str, str]]:
     """Gauges of each residual, half full at the baseline."""
     if not shown.balances:
-        return _line("residual", _residual(shown).removeprefix("residual "), width)
-    line = Text(no_wrap=True)
-    line.append(f"{'residual':<11}", style="dim")
+        return [(_residual(shown).removeprefix("residual "), "")]
+    parts = []
     for balance in shown.balances:
         style = "bold red" if shown.alarm and balance.ratio == shown.ratio else "green"
-        if len(shown.balances) > 1:
-            line.append(f"{balance.name} ", style="dim")
-        line.append(gauge(balance.ratio, _FULL, _GAUGE), style=style)
-        line.append(f" {number(balance.ratio, 2)} ×  ")
-    line.append("of the baseline  ", style="dim")
+        parts += [(f"{balance.name} " if len(shown.balances) > 1 else "", "dim")]
+        parts += [(gauge(balance.ratio, _FULL, _GAUGE), style), (f" {number(balance.ratio, 2)} ×  ", "")]
+    parts.append(("of the baseline  ", "dim"))
     if shown.improved is not None:
-        line.append(
-            "effects: {:.1f} → {:.1f} %".format(*(100 * part for part in shown.improved)), style="dim"
-        )
-    line.truncate(width, overflow="ellipsis")
-    return line
+        before, after = (100 * part for part in shown.improved)
+        parts.append((f"effects: {before:.1f} → {after:.1f} %", "dim"))
+    return parts

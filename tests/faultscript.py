@@ -12,8 +12,6 @@ from typing import Any
 
 from estimator.sample import Status
 
-__all__ = ["SCRIPT", "Fault", "Step"]
-
 Step = tuple[float, str, tuple[Any, ...]]
 
 

@@ -30,8 +30,6 @@ from sim.canopen.node import Node
 from sim.faults import Faults
 from sim.sensors import DriveSignals
 
-__all__ = ["Stage"]
-
 _PATIENCE_S = 30.0  # of the stage's own time; every way back takes less
 
 

@@ -19,8 +19,6 @@ from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
 from estimator.sample import Status
 
-__all__ = ["LockstepStage", "RealStage"]
-
 
 class LockstepStage(Stage):
     """Everything in one thread on the virtual bus; time is the number of cycles."""

@@ -22,12 +22,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import can
-from canopenkit import drive_objects
-from fuzznodes import FuzzNode, encoder_objects, trap_objects
+from fuzznodes import FuzzNode
 
 from drivelink.cycle.sources import CanFrame
-
-__all__ = ["MIXES", "FuzzBus"]
 
 
 def _message(cob_id: int, data: bytes) -> can.Message:
@@ -51,11 +48,7 @@ class FuzzBus:
     """The slaves, the wire and the fuzzer, as the loop sees a bus (`FrameSource`) and as configuration does."""
 
     def __init__(self, generator: random.Random, *, hostile: bool) -> None:
-        self.nodes = [
-            FuzzNode(1, trap_objects(1), starts_itself=True),
-            FuzzNode(2, drive_objects(2)),
-            FuzzNode(3, encoder_objects(3), starts_itself=True),
-        ]
+        self.nodes = [FuzzNode(node) for node in (1, 2, 3)]
         self.errors: dict[str, int] = {}
         self.lost_sends = self.tick = self.frames = self._stamp_ns = 0
         self.rate, self.mix = 0.0, MIXES[0]

@@ -24,8 +24,6 @@ from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile, parse
 from estimator.sample import Estimate, Sample, Status
 
-__all__ = ["FuzzRun", "WrongValidError"]
-
 PERIOD_S = 0.001
 FOLLOW = 'configure = false\nsync = "follow"\n'
 

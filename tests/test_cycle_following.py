@@ -224,11 +224,9 @@ def test_after_a_reset_a_map_that_is_read_back_is_believed():
     (tpdo,) = layout.tpdos
     entries = [o.index << 16 | o.subindex << 8 | o.bits for o in tpdo.objects]
     number = (tpdo.cob_id - 0x82) // 0x100
-    objects = master.run.bus.nodes[1].slave.objects  # it comes back with the map it has stored
-    for place, entry in enumerate(entries, start=1):
-        objects[0x19FF + number, place].value = entry
-    objects[0x19FF + number, 0].value, objects[0x17FF + number, 2].value = len(entries), 1
-    objects[0x17FF + number, 1].value = tpdo.cob_id
+    stored = {(0x19FF + number, place): entry for place, entry in enumerate([len(entries), *entries])}
+    communication = {(0x17FF + number, 1): tpdo.cob_id, (0x17FF + number, 2): 1}
+    master.run.bus.nodes[1].put(stored | communication)  # it comes back with the map it has stored
     master.nmt(START, 2)
     master.syncs(50)
     assert len(master.valid) == 50
@@ -248,11 +246,10 @@ def test_after_a_reset_a_map_that_is_read_back_is_believed():
 def test_a_map_rewritten_while_the_node_sends_is_never_half_believed():
     master = Master()
     master.syncs(20)
-    slave = master.run.bus.nodes[1].slave
     (tpdo,) = master.run.configurator.layouts[2].tpdos
     mapping = 0x19FF + (tpdo.cob_id - 0x82) // 0x100
     for place, entry in ((1, TORQUE), (2, STATUSWORD), (3, POSITION)):
-        slave.objects[mapping, place].value = entry  # a lenient node takes it at once
+        master.run.bus.nodes[1].put({(mapping, place): entry})  # a lenient node takes it at once
         head = b"\x23" + mapping.to_bytes(2, "little") + bytes([place])
         bus = master.run.bus
         bus._queue.append((0x602, head + entry.to_bytes(4, "little")))

@@ -112,6 +112,13 @@ def test_where_nothing_has_changed_nothing_is_proposed(tmp_path):
         acceptance.proposal(tmp_path / "elbow.toml")
 
 
+def test_what_would_do_harm_is_not_proposed(tmp_path, monkeypatch):
+    monkeypatch.setattr(diagnosing, "harm", lambda *_: "it is valid less often")
+    found = diagnosing.make(made := recorded(tmp_path, ("coulomb_friction=0.6",)))
+    assert found["state"] == finding.NOTHING and not proposal_file(made).exists()
+    assert found["sentence"].endswith("Nothing is proposed: it is valid less often.")
+
+
 def touch(folder: Path, *events: str) -> list[Path]:
     paths = [folder / f"elbow-20260105T{event}.mcap" for event in events]
     for path in paths:

@@ -28,6 +28,7 @@ from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
 from estimator.diagnosis import Diagnosis, Errors, diagnose
 from estimator.errors import EstimatorError
+from estimator.harm import Unseen, harm
 from estimator.model_monitor import Second, can_monitor, seconds_of
 from estimator.sample import Record
 
@@ -118,18 +119,19 @@ def make(recording: Path) -> dict[str, Any]:
     held_from = int(part.sequence[round(_TRAINED * (len(part) - 1))])
     trained, held = part.rows(part.sequence < held_from), part.rows(part.sequence >= held_from)
     outcome = diagnose(trained, model, None, held)
-    error, sufficient = _error(part, source.joint, outcome, held_from)
-    proposed = outcome.verdict == "effect" or (outcome.verdict == "sufficient" and not sufficient)
-    if proposed and error.after_rms_nm < error.before_rms_nm:
-        apply_diagnosis.write(source, proposal_file(recording), outcome, part, recording.name, force=True)
-        state = finding.PROPOSED
-    else:
-        state = finding.NOTHING
+    error, state = _error(part, source.joint, outcome, held_from), finding.NOTHING
+    said, harmful = summary(outcome, error, source.joint), None
+    if error.after_rms_nm < error.before_rms_nm and _has_changed(part, source.joint, outcome):
+        proposed = apply_diagnosis.diagnosed_model(source.joint, outcome)
+        harmful = harm(model, proposed, [Unseen(part, held_from)], source.joint.estimator)
+        if harmful is None:
+            apply_diagnosis.write(source, proposal_file(recording), outcome, part, recording.name, force=True)
+            state = finding.PROPOSED
     title = report.Title(source.joint.name, recording.name, None, source.joint.axis == "linear")
     write_whole(page_file(recording), report.html_page(outcome, title), force=True)
-    said = summary(outcome, error, source.joint)
+    sentence = f"{said.sentence} Nothing is proposed: {harmful}." if harmful else said.sentence
     return {
-        **finding.begun(recording, state, said.sentence),
+        **finding.begun(recording, state, sentence),
         "summary": said.short,
         "parameters": list(said.parameters),
         "since": None if rose is None else _unix_s(recording, record, rose[0]),
@@ -140,38 +142,37 @@ def make(recording: Path) -> dict[str, Any]:
     }
 
 
-def _error(part: Record, joint: JointFile, outcome: Diagnosis, held_from: int) -> tuple[Errors, bool]:
-    """The error on held-out data of the model in use and of the proposed one, and whether the former's own
-    baseline allows it.
+def _has_changed(part: Record, joint: JointFile, outcome: Diagnosis) -> bool:
+    """Whether an effect was found, or the model in use fails its own test."""
+    if outcome.verdict != "sufficient":
+        return outcome.verdict == "effect"
+    monitor = make_model_monitor(joint)
+    return monitor is not None and any(map(monitor.core.step, part.samples()))
+
+
+def _error(part: Record, joint: JointFile, outcome: Diagnosis, held_from: int) -> Errors:
+    """The error on held-out data of the model in use and of the proposed one.
 
     Of a model without parameters, which is no model yet, the error before is that of its best fit.
     """
-    model = joint.model()
-    if not can_monitor(model):
-        return outcome.validation, True
+    declared, later = joint.model(), held_from + 1 / part.period_s
+    if not can_monitor(declared):
+        return outcome.validation
     both = []
-    for one in (model, apply_diagnosis.diagnosed_model(joint, outcome)):
-        held = [second for second in seconds_of(part, one) if second.sequence > held_from + 1 / part.period_s]
+    for one in (declared, apply_diagnosis.diagnosed_model(joint, outcome)):
+        held = [second for second in seconds_of(part, one) if second.sequence > later]
         if not held:
-            return outcome.validation, True
-        both.append(
-            [rms([getattr(s, name)[: part.motors] for s in held]) for name in ("residual_nm", "torque_nm")]
-        )
+            return outcome.validation
+        squares = np.square([(s.residual_nm[: part.motors], s.torque_nm[: part.motors]) for s in held])
+        both.append(np.sqrt(np.mean(np.sum(squares, axis=2), axis=0)).tolist())
     (before, torque), (after, _) = both
-    monitor = make_model_monitor(joint)
-    alarms = [monitor.core.step(sample) for sample in part.samples()] if monitor is not None else [False]
-    return Errors(before, after, before / torque, after / torque), not any(alarms)
+    return Errors(before, after, before / torque, after / torque)
 
 
 def _unix_s(recording: Path, record: Record, sequence: int) -> float:
     """UNIX time of a sample, by the stamp of the first one."""
     first = next(read_messages(recording, frozenset({"sample"})))
     return first.log_time_ns * 1e-9 + (sequence - int(record.sequence[0])) * record.period_s
-
-
-def rms(values: Sequence[Sequence[float]]) -> float:
-    """Return the root of the mean over the seconds of the sum over the motors of the squares."""
-    return math.sqrt(float(np.mean(np.sum(np.square(values), axis=1))))
 
 
 def main() -> int:

@@ -34,6 +34,14 @@ REAL_TIME = {
 }  # fmt: skip
 
 
+@pytest.fixture(scope="session")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings and joint files of two joints (fleetkit.py), only read."""
+    import fleetkit
+
+    return fleetkit.make_fleet(tmp_path_factory.mktemp("fleet"))
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.stem in REAL_TIME:

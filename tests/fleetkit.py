@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import functools
-import math
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import diagnosiskit as kit
 import joints
 
 from drivelink.jointfile import parse
 from drivelink.recording.formats import open_sink
-from estimator.sample import Record, Sample
+from estimator.sample import Record
 
 JOINT = f"""\
 name = "{{name}}"
@@ -34,10 +35,10 @@ SECONDS = 4.0
 NAMES = ("elbow", "wrist")
 
 
-def make_fleet(folder: Path, nights: int = 2) -> Path:
+def make_fleet(folder: Path) -> Path:
     """FOLDER/joints and FOLDER/recordings of two joints; the second night of the wrist has friction."""
-    for night in range(nights):
-        world = kit.World([{}, {"coulomb_nm": 0.4} if night % 2 else {}], seed=10 + night, seconds=SECONDS)
+    for night in range(2):
+        world = kit.World([{}, {"coulomb_nm": 0.4} if night else {}], seed=10 + night, seconds=SECONDS)
         for name, record in zip(NAMES, world.run(), strict=True):
             joints.write_csv(record, folder / "recordings" / f"{name}-2026-01-{night + 5:02d}.csv", 9)
     for name in NAMES:
@@ -49,15 +50,21 @@ def make_fleet(folder: Path, nights: int = 2) -> Path:
 
 def write_mcap(record: Record, name: str, path: Path, begin_s: int) -> Path:
     """The record as `drivelink record` writes it: with its joint file in it."""
-    text, nothing = JOINT.format(name=name), math.nan
+    text = JOINT.format(name=name)
     sink = open_sink(path, parse(text), text)
-    assert record.link_position_rad is not None
-    columns = (record.motor_position_rad, record.motor_torque_nm, record.link_position_rad)
-    for sequence, (theta, torque, link) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
-        sample = Sample(sequence, tuple(theta), (nothing,), tuple(torque), link, nothing, nothing)
-        sink.sample(sample, begin_s * 10**9 + sequence * 10**6)
+    for sample in record.samples():
+        sink.sample(sample, begin_s * 10**9 + sample.sequence * 10**6)
     sink.close()
     return path
+
+
+def row(digest: str = "a", joint: str | None = "elbow", **more: Any) -> dict[str, Any]:
+    """A row of a table."""
+    return {
+        "id": f"{digest}-{joint}", "joint": joint, "digest": digest, "recording": f"{digest}.csv", "size_bytes": 1,
+        "stamp": "s", "status": "done", "version": "1", "accepted_model": "m", "transmission": 1,
+        "time": datetime(2026, 1, 1, tzinfo=UTC),
+    } | more  # fmt: skip
 
 
 class _Quiet(SimpleHTTPRequestHandler):
@@ -77,9 +84,8 @@ def served(folder: Path) -> Iterator[str]:
 
 
 def ids(folder: Path) -> list[str]:
-    """The ids of the rows in a table."""
+    """The ids of the rows in a table, as DuckDB or pandas would see them."""
     from pyarrow import parquet
 
-    """As DuckDB or pandas would see them."""
     parts = sorted(folder.glob("table/*.parquet"))
     return sorted(name for part in parts for name in parquet.read_table(part)["id"].to_pylist())

@@ -19,25 +19,19 @@ from urllib.request import urlopen
 import fleetkit
 import pytest
 
-REASON = "the extra [fleet] is not installed"
-pytest.importorskip("distributed", reason=REASON)
-pq = pytest.importorskip("pyarrow.parquet", reason=REASON)
+pytest.importorskip("distributed", reason="the extra [fleet] is not installed")
 
-from drivelink.cli import main  # noqa: E402
-from drivelink.fleet import runner, storage  # noqa: E402
-from drivelink.fleet.joints import Joints  # noqa: E402
-from drivelink.fleet.storage import Store  # noqa: E402
-from drivelink.fleet.table import read_rows  # noqa: E402
+from drivelink.cli import main
+from drivelink.fleet import runner, storage
+from drivelink.fleet.joints import Joints
+from drivelink.fleet.storage import Store
+from drivelink.fleet.table import read_rows
+from drivelink.fleet.task import HELD_OUT
 
 # Dask's own: a process that was ended on purpose leaves sockets behind.
 pytestmark = pytest.mark.filterwarnings(
     "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
-
-
-@pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return fleetkit.make_fleet(tmp_path_factory.mktemp("fleet"))
 
 
 def run_fleet(fleet: Path, out: Path, *more: str, recordings: Path | None = None) -> int:
@@ -51,25 +45,26 @@ def run_fleet(fleet: Path, out: Path, *more: str, recordings: Path | None = None
 @pytest.mark.slow
 def test_from_recordings_to_a_page(fleet, tmp_path, capsys):
     recordings = shutil.copytree(fleet / "recordings", tmp_path / "recordings")
-    (recordings / "wrist-2026-01-05.csv").unlink()
+    for path in recordings.glob("wrist-*"):
+        path.unlink()
     shutil.copy(recordings / "elbow-2026-01-05.csv", recordings / "elbow-2026-01-05-copy.csv")
     (recordings / "elbow-2026-01-07.csv").write_text("nothing")
     out = tmp_path / "out"
     assert run_fleet(fleet, out, "--workers", "1", "--validate", "previous", recordings=recordings) == 0
     said = capsys.readouterr()
-    assert "5 recordings: 3 done, 1 there already, 1 broken" in said.out
+    assert "4 recordings: 2 done, 1 there already, 1 broken" in said.out
     assert "elbow-2026-01-07.csv" in said.err
     rows = read_rows(Store(str(out)))
-    assert sorted((r["joint"], r["status"]) for r in rows) == [("elbow", "done")] * 2 + [
-        ("elbow", "error"), ("wrist", "done"),
-    ]  # fmt: skip
+    assert sorted(r["status"] for r in rows) == ["done", "done", "error"]
     document = json.loads((out / "fleet.json").read_text())
     assert document["schema"] == "drivelink.fleet/1"
-    assert {one["joint"]: one["recordings"] for one in document["joints"]} == {"elbow": 3, "wrist": 1}
+    assert {one["joint"]: one["recordings"] for one in document["joints"]} == {"elbow": 3}
     page = (out / "fleet.html").read_text()
     assert not re.search(
         r"""(?:src|href)=["']?(?:\w+:)?//|url\(|@import|<script|<link""", page
     )  # self-contained
+    validated = {r["validated_on"].rpartition("/")[2] for r in rows if r["status"] == "done"}
+    assert len(validated) == 2 and validated < {HELD_OUT, "elbow-2026-01-05.csv", "elbow-2026-01-05-copy.csv"}
     for r in rows:
         assert r["status"] == "error" or (out / r["report"]).exists()
         assert r["report"] is None or r["report"] in page
@@ -78,7 +73,7 @@ def test_from_recordings_to_a_page(fleet, tmp_path, capsys):
     assert "too early" in capsys.readouterr().out
     before = fleetkit.ids(out)
     assert run_fleet(fleet, out, recordings=recordings) == 0
-    assert "0 done, 5 there already" in capsys.readouterr().out
+    assert "0 done, 4 there already" in capsys.readouterr().out
     assert fleetkit.ids(out) == before
     assert main(["fleet", "report", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads((out / "fleet.json").read_text())
@@ -94,7 +89,12 @@ def test_a_killed_worker_loses_nothing_and_doubles_nothing(fleet, tmp_path):
         path = tmp_path / name
         path.write_text(getattr(secret, f"tls_{name.replace('-', '_').replace('.', '_')}"))
         files[f"distributed.comm.tls.{name}"] = str(path)
-    sources, _ = storage.find([str(fleet / "recordings")])
+    recordings = tmp_path / "recordings"
+    recordings.mkdir()
+    shutil.copy(fleet / "recordings" / "elbow-2026-01-05.csv", recordings)
+    for k in range(8):  # read in no time, to a row with an error
+        (recordings / f"elbow-{k}.csv").write_text(f"nothing {k}")
+    sources, _ = storage.find([str(recordings)])
     with (
         LocalCluster(
             n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", security=secret
@@ -112,7 +112,7 @@ def test_a_killed_worker_loses_nothing_and_doubles_nothing(fleet, tmp_path):
         settings = runner.Settings(scheduler=address)
         counts = runner.run(sources, Joints.load(fleet / "joints"), Store(str(tmp_path)), settings, kill_one)
     assert killed
-    assert (counts.done, counts.broken) == (len(sources), 0)
+    assert (counts.done, counts.broken) == (1, 8)
     assert sorted(r["recording"] for r in read_rows(Store(str(tmp_path)))) == [one.url for one in sources]
 
 
@@ -121,20 +121,20 @@ def test_ctrl_c_leaves_what_is_finished(fleet, tmp_path):
     recordings = tmp_path / "recordings"
     recordings.mkdir()
     lines = (fleet / "recordings" / "elbow-2026-01-05.csv").read_text().splitlines(keepends=True)
-    for k in range(40):  # each is a content of its own
-        (recordings / f"elbow-{k:02d}.csv").write_text("".join(lines[: len(lines) - k]))
+    for k in range(6):  # each is a content of its own
+        (recordings / f"elbow-{k}.csv").write_text("".join(lines[: len(lines) - k]))
     out = tmp_path / "out"
     command = [sys.executable, "-m", "drivelink", "fleet", str(recordings), "--joints", str(fleet / "joints")]
     command += ["--out", str(out), "--workers", "1"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     end = time.monotonic() + 90
-    while len(list(out.glob("diagnoses/*/*/report.html"))) < 3 and time.monotonic() < end:
+    while len(list(out.glob("diagnoses/*/*/report.html"))) < 1 and time.monotonic() < end:
         time.sleep(0.1)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in error
-    assert 3 <= len(read_rows(Store(str(out)))) < 40
+    assert 1 <= len(read_rows(Store(str(out)))) < 6
 
 
 def test_a_ctrl_c_that_a_finaliser_discards_ends_the_run_all_the_same():

@@ -13,32 +13,17 @@ from typing import Any
 import fleetkit
 import numpy as np
 import pytest
+from fleetkit import row
 
-REASON = "the extra [fleet] is not installed"
-pytest.importorskip("distributed", reason=REASON)
-pq = pytest.importorskip("pyarrow.parquet", reason=REASON)
+pytest.importorskip("distributed", reason="the extra [fleet] is not installed")
 
-from drivelink.fleet import table  # noqa: E402
-from drivelink.fleet.page import page  # noqa: E402
-from drivelink.fleet.storage import FleetError, Source, Store  # noqa: E402
-from drivelink.fleet.summary import COLUMNS, summarise  # noqa: E402
-from drivelink.fleet.table import FleetTable, read_rows  # noqa: E402
-
-# Dask's own: a process that was ended on purpose leaves sockets behind.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
-)
-
+from drivelink.fleet import table
+from drivelink.fleet.page import page
+from drivelink.fleet.storage import FleetError, Source, Store
+from drivelink.fleet.summary import COLUMNS, summarise
+from drivelink.fleet.table import FleetTable, read_rows
 
 # The table
-
-
-def row(digest: str = "a", joint: str | None = "elbow", **more: Any) -> dict[str, Any]:
-    return {
-        "id": f"{digest}-{joint}", "joint": joint, "digest": digest, "recording": f"{digest}.csv", "size_bytes": 1,
-        "stamp": "s", "status": "done", "version": "1", "accepted_model": "m", "transmission": 1,
-        "time": datetime(2026, 1, 1, tzinfo=UTC),
-    } | more  # fmt: skip
 
 
 def append(folder: Path, *rows: dict[str, Any]) -> None:
@@ -192,8 +177,8 @@ def test_the_examples_of_the_documentation_read_the_table(tmp_path, monkeypatch,
 def test_the_table_is_data_on_the_page(report):
     rows = [night("elbow", k, 150.0, ["coulomb_friction@motor"]) for k in range(8)]
     good = "diagnoses/elbow/0123456789abcdef01234567-2/report.html"
-    for row in rows:
-        row |= {"report": report, "sentence": "<script>alert(1)</script>"}
+    for one in rows:
+        one |= {"report": report, "sentence": "<script>alert(1)</script>"}
     rows[-1]["report"] = good
     text = page(summarise(rows, 0.05))
     assert report not in text and "<script" not in text

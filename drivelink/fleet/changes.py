@@ -265,16 +265,6 @@ def appearance(found: NDArray[np.bool_]) -> Appearance:
     )
 
 
-def q_values(p: FloatArray) -> FloatArray:
-    """Return each test's smallest false discovery rate as a discovery (Benjamini and Hochberg 1995)."""
-    n = len(p)
-    order = np.argsort(p)
-    ranked = np.asarray(p)[order] * n / np.arange(1, n + 1)
-    q = np.empty(n)
-    q[order] = np.minimum(np.minimum.accumulate(ranked[::-1])[::-1], 1.0)
-    return q
-
-
 def usable(row: dict[str, Any]) -> bool:
     """Return whether a row has a usable stiffness."""
     value, std = row["stiffness_middle_nm_rad"], row["stiffness_std_middle_nm_rad"]

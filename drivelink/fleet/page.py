@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import html
-import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from string import Template
 from typing import Any, NamedTuple
 
+from matplotlib.ticker import MaxNLocator
+
 from drivelink.fleet.summary import LOOK, STATES, spaced
+from drivelink.output.document import Block, Document, Grid, Markup, Paragraph, Rows, Section, drawn
+from drivelink.output.document import page as draw
 from drivelink.output.numbers import Units, bare_name, in_words, number, with_interval
 from estimator.sample import SIGMA_95
 
@@ -48,25 +50,25 @@ def page(document: dict[str, Any]) -> str:
     """Draw the document of `summarise`."""
     joints = document["joints"]
     orders = _orders(joints)
-    template = Template(Path(__file__).with_name("fleet.html").read_text(encoding="utf-8"))
-    return template.substitute(
-        headline=html.escape(_headline(joints)),
-        controls=_controls(joints),
-        styles=_styles(joints),
-        about=html.escape(_about(document)),
-        joints="".join(
-            _line(joint, order, k < _CHARTS)
-            for k, (joint, order) in enumerate(zip(joints, orders, strict=True))
-        ),
-        details="".join(map(_details, joints[:_CHARTS], orders)) + _rest(joints),
-        broken=_broken(document["broken"]),
-        method=html.escape(
-            f"{document['method']}. {document['tests']} series tested; false discovery rate "
-            f"{document['false_discovery_rate']:g}: of all changes named here, at most this share is "
-            f"expected to be chance. Bars are 95 % intervals. drivelink {document['version']}, "
-            f"{document['written']}."
-        ),
+    lines = "".join(_line(one, orders[k], k < _CHARTS) for k, one in enumerate(joints))
+    details = "".join(map(_details, joints[:_CHARTS], orders))
+    left = len(joints) - _CHARTS
+    rest = f"{left} less urgent joints have no chart here; fleet.json has them." if left > 0 else ""
+    method = (
+        f"{document['method']}. {document['tests']} series tested; false discovery rate "
+        f"{document['false_discovery_rate']:g}: of all changes named here, at most this share is "
+        f"expected to be chance. Bars are 95 % intervals. drivelink {document['version']}, "
+        f"{document['written']}."
     )
+    table = f'<table class="all"><tbody class="joints sorted">{lines}</tbody></table>'
+    sections = [
+        Section("", [Markup(_controls(joints) + table)]),
+        Section("Each joint", [Markup(f'<div class="sorted">{details}</div>'), Paragraph(rest)]),
+        *_broken(document["broken"]),
+        Section("How it was decided", [Paragraph(method, style="method")]),
+    ]
+    style = Path(__file__).with_name("fleet.css").read_text(encoding="utf-8") + _styles(joints)
+    return draw(Document(_headline(joints), _about(document), sections, style))
 
 
 def _headline(joints: Sequence[dict[str, Any]]) -> str:
@@ -113,7 +115,7 @@ def _styles(joints: Sequence[dict[str, Any]]) -> str:
         f"body:has(#show-{state}:not(:checked)) .is-{state} {{ display: none; }}"
         for state in sorted({joint["state"] for joint in joints})
     ]
-    return "\n  ".join(rules)
+    return "\n".join(rules)
 
 
 def _about(document: dict[str, Any]) -> str:
@@ -158,7 +160,7 @@ def _details(joint: dict[str, Any], order: str) -> str:
     return (
         f'<details id="{name}" class="joint is-{joint["state"]}" style="{order}"{opened}>'
         f"<summary><b>{name}</b>{html.escape(joint['sentence'])}</summary>"
-        f'{charts}<div class="small">{others}</div>{_effects(joint)}{_diagnoses(joint)}</details>\n'
+        f'{charts}<div class="small">{others}</div>{drawn(_effects(joint))}{_diagnoses(joint)}</details>\n'
     )
 
 
@@ -199,7 +201,7 @@ def _figure(joint: dict[str, Any], one: dict[str, Any]) -> str:
     )
     body = "".join(parts)
     return (
-        f'<figure class="wide"><svg viewBox="0 0 {_WIDTH:g} {height:g}" role="img">{body}</svg>'
+        f'<figure class="large"><svg viewBox="0 0 {_WIDTH:g} {height:g}" role="img">{body}</svg>'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
     )
 
@@ -236,7 +238,10 @@ def _frame(joint: dict[str, Any], one: dict[str, Any], left: float, width: float
 def _axes(frame: _Frame, height: float) -> str:
     parts = []
     right = frame.left + frame.width
-    for value in _ticks(frame.low, frame.high, 4.0 if frame.height > 150.0 else 2.0):
+    ticks = MaxNLocator(8 if frame.height > 150.0 else 4, steps=[1, 2, 5, 10])
+    for value in ticks.tick_values(frame.low, frame.high):
+        if not frame.low <= value <= frame.high:
+            continue
         y = frame.y(value)
         parts.append(f'<line class="grid" x1="{frame.left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text x="{frame.left - 8}" y="{y + 4:.1f}" text-anchor="end">{value:.6g}</text>')
@@ -244,13 +249,6 @@ def _axes(frame: _Frame, height: float) -> str:
     parts.append(f'<text x="{frame.left}" y="{height - 5:.1f}">{first}</text>')
     parts.append(f'<text x="{right}" y="{height - 5:.1f}" text-anchor="end">{last}</text>')
     return "".join(parts)
-
-
-def _ticks(low: float, high: float, least: float) -> list[float]:
-    """Round values between two, about so many or up to twice as many."""
-    power = 10.0 ** math.floor(math.log10((high - low) / least))
-    step = max(factor * power for factor in (1.0, 2.0, 5.0) if factor * power <= (high - low) / least)
-    return [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def _bands(one: dict[str, Any], frame: _Frame) -> str:
@@ -315,30 +313,21 @@ def _minute(time: str) -> str:
     return time[:16].replace("T", " ")
 
 
-def _effects(joint: dict[str, Any]) -> str:
-    if not joint["effects"]:
-        return ""
-    heads = ("found", "at", "in", "", "error without → with it", "")
-    lines = []
+def _effects(joint: dict[str, Any]) -> list[Grid]:
+    rows: Rows = []
     for effect in joint["effects"]:
-        names = html.escape(", ".join(map(in_words, effect["names"])))
-        since = effect["since"][:10] + (" (significant)" if effect["significant"] else "")
-        count = f"{effect['recordings']} of {effect['of']}"
         before, after = (number(100.0 * effect[f"error_{when}_relative"], 3) for when in ("before", "after"))
-        cells = (
-            names,
-            html.escape(spaced(effect["location"])),
-            f"{count} recordings",
-            f"since {since}",
-            f"{before} → {after} % of the torque",
-            _link(effect["report"], "diagnosis"),
+        rows.append(
+            (
+                ", ".join(map(in_words, effect["names"])),
+                spaced(effect["location"]),
+                f"{effect['recordings']} of {effect['of']} recordings",
+                f"since {effect['since'][:10]}" + (" (significant)" if effect["significant"] else ""),
+                f"{before} → {after} % of the torque",
+                Markup(_link(effect["report"], "diagnosis")),
+            )
         )
-        lines.append(_row("td", cells))
-    return f"<table class='effects'><thead>{_row('th', heads)}</thead><tbody>{''.join(lines)}</tbody></table>"
-
-
-def _row(tag: str, cells: Iterable[str]) -> str:
-    return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in cells) + "</tr>"
+    return [Grid(("found", "at", "in", "", "error without → with it", ""), rows)] if rows else []
 
 
 def _diagnoses(joint: dict[str, Any]) -> str:
@@ -347,20 +336,12 @@ def _diagnoses(joint: dict[str, Any]) -> str:
     return f"<details><summary>{len(ones)} diagnoses</summary><p>{links}</p></details>" if ones else ""
 
 
-def _rest(joints: Sequence[dict[str, Any]]) -> str:
-    left = len(joints) - _CHARTS
-    return f"<p>{left} less urgent joints have no chart here; fleet.json has them.</p>" if left > 0 else ""
-
-
-def _broken(rows: Iterable[dict[str, Any]]) -> str:
-    rows = list(rows)
-    if not rows:
-        return ""
-    lines = "".join(
-        _row("td", (html.escape(r["recording"]), html.escape(r["error"]))) for r in rows[:_BROKEN]
-    )
-    more = f"<p>and {len(rows) - _BROKEN} more, in fleet.json.</p>" if len(rows) > _BROKEN else ""
-    return f"<h2>Recordings that could not be used</h2><table><tbody>{lines}</tbody></table>{more}"
+def _broken(broken: Sequence[dict[str, Any]]) -> list[Section]:
+    rows: Rows = [(row["recording"], row["error"]) for row in broken[:_BROKEN]]
+    blocks: list[Block] = [Grid(("recording", ""), rows)]
+    if len(broken) > _BROKEN:
+        blocks.append(Paragraph(f"and {len(broken) - _BROKEN} more, in fleet.json."))
+    return [Section("Recordings that could not be used", blocks)] if rows else []
 
 
 def _seconds(time: str) -> float:

@@ -10,7 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import islice, pairwise
 from types import FrameType
@@ -76,7 +76,6 @@ class Counts:
     known: int = 0
     early: int = 0
     broken: int = 0
-    errors: list[str] = field(default_factory=list)
 
 
 def run(
@@ -186,7 +185,7 @@ def _take(
     if outcome.kind == "early":
         counts.early += 1
         return
-    if outcome.kind == "known" or _already(outcome, table):
+    if outcome.kind == "known" or table.has_now(outcome.rows[0]["digest"], outcome.rows[0]["joint"]):
         counts.known += 1
         return
     for name, text in outcome.reports:  # before their row
@@ -194,15 +193,9 @@ def _take(
     table.append(outcome.rows)
     if outcome.kind == "error":
         counts.broken += 1
-        counts.errors.append(f"{task.source.url}: {outcome.rows[0]['error']}")
-        say(counts.errors[-1])
+        say(f"{task.source.url}: {outcome.rows[0]['error']}")
     else:
         counts.done += 1
-
-
-def _already(outcome: Outcome, table: FleetTable) -> bool:
-    """Whether this run has already processed the same content."""
-    return table.has_now(outcome.rows[0]["digest"], outcome.rows[0]["joint"])
 
 
 @contextmanager

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 from uuid import uuid4
 
-import fsspec
 from fsspec.core import url_to_fs
+from fsspec.implementations.local import LocalFileSystem
 
 from drivelink.errors import DrivelinkError
 from drivelink.files import open_regular, write_whole
@@ -32,7 +32,6 @@ class FleetError(DrivelinkError):
     exit_status = 3
 
 
-_CHUNK = 1 << 20
 _MODIFIED = ("mtime", "LastModified", "last_modified", "Last-Modified", "time", "created")
 
 
@@ -74,17 +73,13 @@ def find(patterns: Iterable[str]) -> tuple[list[Source], list[str]]:
 
 def _listed(pattern: str) -> list[Source]:
     fs, path = _opened(pattern)
-    try:
+    with _checked(f"{pattern}: cannot be listed"):
         if any(sign in path for sign in "*?["):
             entries = fs.glob(path, detail=True)
         elif fs.isdir(path) and not _is_recording(path):
             entries = fs.find(path, detail=True)
-        elif fs.exists(path):
-            entries = {path: fs.info(path)}
         else:
-            entries = {}
-    except Exception as error:
-        raise FleetError(f"{pattern}: cannot be listed: {_line(error)}") from error
+            entries = {path: fs.info(path)} if fs.exists(path) else {}
     single = path in entries and len(entries) == 1
     return [
         _source(_url(pattern, fs, str(name)), info)
@@ -117,13 +112,23 @@ def _time(value: Any) -> datetime | None:
 
 
 def _opened(url: str) -> tuple[Any, str]:
-    try:
-        fs, path = url_to_fs(url)
-    except ImportError as error:
-        raise FleetError(f"{url}: {_line(error)}") from error
-    except Exception as error:
-        raise FleetError(f"{url}: cannot be reached: {_line(error)}") from error
+    with _checked(f"{url}: cannot be reached"):
+        try:
+            fs, path = url_to_fs(url)
+        except ImportError as error:
+            raise FleetError(f"{url}: {_line(error)}") from error
     return fs, str(path)
+
+
+@contextmanager
+def _checked(what: str) -> Iterator[None]:
+    """Make one line of what a storage raises."""
+    try:
+        yield
+    except FleetError:
+        raise
+    except Exception as error:
+        raise FleetError(f"{what}: {_line(error)}") from error
 
 
 def _url(pattern: str, fs: Any, path: str) -> str:
@@ -148,28 +153,18 @@ def fetched(source: Source) -> Iterator[tuple[Path, str]]:
     Raises:
         OSError: it cannot be read.
     """
-    if "://" not in source.url:
-        path = Path(source.url)
-        with open_regular(path) as file:
-            yield path, hashlib.file_digest(file, "sha256").hexdigest()
-        return
     with tempfile.TemporaryDirectory(prefix="drivelink-fleet-") as folder:
-        path = Path(folder) / source.name
-        digest = _copy(source.url, path)
-        if path.suffix.lower() in CAN_SUFFIXES:
-            with suppress(FileNotFoundError):  # most have none
-                _copy(source.url + side_file(path).name.removeprefix(path.name), side_file(path))
+        path = Path(source.url)
+        if "://" in source.url:
+            path = Path(folder) / source.name
+            fs, place = _opened(source.url)
+            fs.get_file(place, str(path))
+            if path.suffix.lower() in CAN_SUFFIXES:
+                with suppress(FileNotFoundError):  # most have none
+                    fs.get_file(place + side_file(path).name.removeprefix(path.name), str(side_file(path)))
+        with open_regular(path) as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
         yield path, digest
-
-
-def _copy(url: str, path: Path) -> str:
-    """Copy a remote file in pieces; its SHA-256."""
-    digest = hashlib.sha256()
-    with fsspec.open(url, "rb") as remote, path.open("wb") as copy:
-        while piece := remote.read(_CHUNK):
-            digest.update(piece)
-            copy.write(piece)
-    return digest.hexdigest()
 
 
 class Store:
@@ -188,9 +183,8 @@ class Store:
     def __init__(self, url: str) -> None:
         self.url = url  # as given
         self._fs, self._root = _opened(url)
-        local = "file" in ([self._fs.protocol] if isinstance(self._fs.protocol, str) else self._fs.protocol)
-        self.folder: Path | None = Path(self._root) if local else None  # the local folder, or None
-        self._made: set[str] = set()
+        # the local folder, or None
+        self.folder: Path | None = Path(self._root) if isinstance(self._fs, LocalFileSystem) else None
 
     def write(self, name: str, data: bytes) -> None:
         """Write or replace a file.
@@ -199,8 +193,8 @@ class Store:
             FleetError: it cannot be written.
         """
         target = f"{self._root}/{name}"
-        try:
-            self._make(target.rpartition("/")[0])
+        with _checked(f"{self.url}/{name}: cannot be written"):
+            self._fs.makedirs(target.rpartition("/")[0], exist_ok=True)
             if self.folder is not None:
                 write_whole(Path(target), data, force=True)
             elif hasattr(self._fs, "ftp"):
@@ -209,13 +203,6 @@ class Store:
                 self._fs.ftp.posix_rename(temporary, target)
             else:
                 self._fs.pipe_file(target, data)
-        except Exception as error:
-            raise FleetError(f"{self.url}/{name}: cannot be written: {_line(error)}") from error
-
-    def _make(self, folder: str) -> None:
-        if folder not in self._made:
-            self._fs.makedirs(folder, exist_ok=True)
-            self._made.add(folder)
 
     def read(self, name: str) -> bytes:
         """Return the content of a file.
@@ -223,26 +210,19 @@ class Store:
         Raises:
             FleetError: it cannot be read.
         """
-        try:
+        with _checked(f"{self.url}/{name}: cannot be read"):
             return bytes(self._fs.cat_file(f"{self._root}/{name}"))
-        except Exception as error:
-            raise FleetError(f"{self.url}/{name}: cannot be read: {_line(error)}") from error
 
     def names(self, folder: str, suffix: str) -> list[str]:
         """Return the names of a folder's files with this ending, relative to the store; no hidden ones."""
         self._fs.invalidate_cache()
-        try:
-            paths = self._fs.ls(f"{self._root}/{folder}", detail=False)
-        except FileNotFoundError:
-            return []
-        except Exception as error:
-            raise FleetError(f"{self.url}: cannot be listed: {_line(error)}") from error
+        with _checked(f"{self.url}: cannot be listed"):
+            place = f"{self._root}/{folder}"
+            paths = self._fs.ls(place, detail=False) if self._fs.exists(place) else []
         names = (str(path).rstrip("/").rpartition("/")[2] for path in paths)
         return sorted(f"{folder}/{n}" for n in names if n.endswith(suffix) and not n.startswith("."))
 
     def remove(self, name: str) -> None:
         """Delete a file, if it exists."""
-        try:
+        with suppress(FileNotFoundError):
             self._fs.rm_file(f"{self._root}/{name}")
-        except FileNotFoundError:
-            return

@@ -9,6 +9,7 @@ from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import false_discovery_control
 
 from drivelink import __version__
 from drivelink.fleet.analysis import stiffness_at
@@ -21,7 +22,6 @@ from drivelink.fleet.changes import (
     iso,
     lost,
     parameters,
-    q_values,
     series_test,
     unusable,
     usable,
@@ -85,10 +85,9 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
     places = {name: _places(one) for name, one in joints.items()}
     p = [s.test.p_value for name in joints for s in series[name]]
     p += [place.test.p_value for name in joints for place in places[name]]
-    q = iter(q_values(np.array(p)).tolist())
-    level = (
-        false_discovery_rate * sum(x <= false_discovery_rate for x in q_values(np.array(p))) / max(len(p), 1)
-    )
+    found = false_discovery_control(p).tolist() if p else []
+    level = false_discovery_rate * sum(q <= false_discovery_rate for q in found) / max(len(p), 1)
+    q = iter(found)
     transmissions = {
         name: [_transmission(s, next(q), false_discovery_rate, level) for s in series[name]]
         for name in joints
@@ -161,8 +160,9 @@ def _places(rows: list[dict[str, Any]]) -> list[_Place]:
 def _transmission(series: _Series, q: float, rate: float, level: float) -> dict[str, Any]:
     significant = q <= rate
     found = changes(series.time_s, series.value, series.std, level) if significant else []
-    base = float(np.median(series.value)) if not found else _start(series, found)
-    fitted = base + sum((change.shape for change in found), np.zeros(len(series.value)))
+    change = sum((one.shape for one in found), np.zeros(len(series.value)))
+    base = float(np.median(series.value - change))  # the level before any change
+    fitted = base + change
     return {
         "transmission": series.transmission,
         "deflection_rad": series.deflection_rad,
@@ -171,7 +171,7 @@ def _transmission(series: _Series, q: float, rate: float, level: float) -> dict[
         "significant": significant,
         "stiffness_nm_rad": float(fitted[-1]),
         "scatter_relative": series.test.scatter / base,
-        "changes": [_changed(series, change, base) for change in found],
+        "changes": [_changed(series, one, base) for one in found],
         "series": [
             {
                 "time": iso(row["time"]),
@@ -185,13 +185,6 @@ def _transmission(series: _Series, q: float, rate: float, level: float) -> dict[
             for row, value, std, level_ in zip(series.rows, series.value, series.std, fitted, strict=True)
         ],
     }
-
-
-def _start(series: _Series, found: list[SeriesChange]) -> float:
-    """The level before any change."""
-    return float(
-        np.median(series.value - sum((change.shape for change in found), np.zeros(len(series.value))))
-    )
 
 
 def _changed(series: _Series, change: SeriesChange, base: float) -> dict[str, Any]:

@@ -73,7 +73,6 @@ class FleetTable:
     """
 
     def __init__(self, store: Store) -> None:
-        self.appended = 0  # recordings appended by this run
         self._store, self._lock = store, _locked(store)
         self._parts = store.names(FOLDER, ".parquet")
         self._by_place: dict[tuple[str, int, str], Known] = {}
@@ -124,7 +123,6 @@ class FleetTable:
             self._rows.append(row | {"written": now})
             self._remember(row)
         self._now.add((rows[0]["digest"], rows[0]["joint"]))
-        self.appended += 1
         full = len(self._rows) >= _PART_ROWS
         if full or time.monotonic() - self._flushed > max(_FLUSH_S, self._cost / _FLUSH_SHARE):
             self.flush()
@@ -210,17 +208,9 @@ def _read(store: Store, part: str, columns: list[str] | None = None) -> Any:
     """Read a part; columns missing in an older version are empty."""
     wanted = SCHEMA if columns is None else pa.schema([SCHEMA.field(name) for name in columns])
     try:
-        file = pq.ParquetFile(io.BytesIO(store.read(part)))
-        table = file.read([name for name in wanted.names if name in file.schema_arrow.names])
+        return pq.read_table(io.BytesIO(store.read(part)), schema=wanted)
     except pa.ArrowException as error:
         raise FleetError(f"{store.url}/{part}: expected a Parquet file of drivelink: {error}") from error
-    arrays = [
-        table.column(field.name).cast(field.type)
-        if field.name in table.column_names
-        else pa.nulls(table.num_rows, field.type)
-        for field in wanted
-    ]
-    return pa.Table.from_arrays(arrays, schema=wanted)
 
 
 def _bytes(table: Any) -> bytes:

@@ -11,7 +11,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import chain
@@ -28,10 +28,10 @@ from drivelink.jointfile import JointFile
 from drivelink.output.report import Title
 from drivelink.recording.canframes import FrameLog, is_frame_log
 from drivelink.recording.canlog import CAN_SUFFIXES, read_frames
-from drivelink.recording.columns import column_map, sample_columns, sample_row
+from drivelink.recording.columns import column_map, renamed, sample_columns, sample_row
 from drivelink.recording.corrections import gate
 from drivelink.recording.cycles import Cycle
-from drivelink.recording.formats import FORMATS
+from drivelink.recording.formats import FORMATS, first_row
 from drivelink.recording.mcapfile import read_messages, recorded_cycles
 from estimator.errors import EstimatorError
 from estimator.sample import Record
@@ -236,9 +236,8 @@ def _results(
         for piece in pieces(path, file, base, limit):
             at = piece.record.start_s + float(piece.record.sequence[0]) * piece.record.period_s
             begin = at if begin is None else begin
-            title = Title(
-                joint.name, _part_name(task.source.name, piece), None if validation is None else where
-            )
+            part = f", part {piece.part} of {piece.parts}" if piece.parts > 1 else ""
+            title = Title(joint.name, task.source.name + part, None if validation is None else where)
             remarks = gate(path, file, piece.record, strict=True)
             analysis = analyse(piece.record, file, validation, title, remarks)
             suffix = f"-{piece.part}" if piece.parts > 1 else ""
@@ -256,10 +255,6 @@ def _results(
     return rows, reports
 
 
-def _part_name(name: str, piece: Piece) -> str:
-    return name if piece.parts == 1 else f"{name}, part {piece.part} of {piece.parts}"
-
-
 @contextmanager
 def _validation(task: Task, joint: Joint, base: Path) -> Iterator[Record | None]:
     """The joint's previous recording; None, with a note, if it cannot be read."""
@@ -272,7 +267,7 @@ def _validation(task: Task, joint: Joint, base: Path) -> Iterator[Record | None]
             read = recording.read(path, joint.file, base_dir=base)
             gate(path, joint.file, read, strict=True)
             record = read
-    except (RecordingError, OSError) as error:
+    except (DrivelinkError, OSError) as error:
         logging.getLogger("drivelink.fleet").warning("validated on held-out blocks: %s", error)
     yield record
 
@@ -308,19 +303,10 @@ def recorded_time(path: Path, source: Source, joint: JointFile | None = None) ->
 
 def _first_time(path: Path, joint: JointFile | None) -> float:
     """`time_s` of the first row of a CSV; 0 if not found."""
-    declared = column_map(joint, None).get("time_s")
-    with path.open("r", encoding="utf-8-sig", errors="replace") as file:
-        lines = (line.strip() for line in file)
-        rows = (line for line in lines if line and not line.startswith("#"))
-        header, first = next(rows, ""), next(rows, "")
-    separator = max(",;\t", key=header.count)
-    names = [name.strip().strip("\"'") for name in header.split(separator)]
-    name, factor = declared[:2] if declared and declared.column in names else ("time_s", 1.0)
-    try:
-        cell = first.split(separator)[names.index(name)]
-        return factor * float(cell.strip().strip("\"'").replace(",", "."))
-    except (ValueError, IndexError):
-        return 0.0
+    names = column_map(joint, None)
+    with suppress(DrivelinkError, KeyError, IndexError):
+        return float(renamed(first_row(path, names), names, path.name)["time_s"][0])
+    return 0.0
 
 
 def _declared_limit() -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drivelink.output import plots
-from drivelink.output.document import Chart, Document, Grid, Paragraph, Section, Share
+from drivelink.output.document import Chart, Document, Grid, Paragraph, Rows, Section
 from drivelink.output.numbers import Units
 from estimator.comparison import Correlation, Curve, correlations, friction_curve, stiffness_curve
 from estimator.errors import EstimatorError
@@ -139,7 +139,7 @@ class Comparison:
         return sections
 
     def _differences(self) -> Grid:
-        rows: list[tuple[str | Share, ...]] = []
+        rows: Rows = []
         for one in self.differences():
             unit = self.units.shown("N·m/rad" if one.kind == "stiffness" else "N·m")
             apart = f"{abs(one.b - one.a) / one.std:.1f} σ" if one.std > 0.0 else "–"
@@ -150,7 +150,7 @@ class Comparison:
         return Grid(("where they differ most", "at", "A", "B", "apart"), rows)
 
     def _fits(self) -> Grid:
-        rows: list[tuple[str | Share, ...]] = []
+        rows: Rows = []
         for side, a, b in self.runs:
             rows.append((f"{side.name}, windows of {a.horizon_s:.3g} s",))
             for name in a.channels:

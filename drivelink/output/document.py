@@ -28,6 +28,12 @@ class Paragraph(NamedTuple):
     style: str = ""
 
 
+class Markup(NamedTuple):
+    """HTML of our own making, a cell or a block, on a page only."""
+
+    html: str
+
+
 class Share(NamedTuple):
     """A cell with a bar: its text, and the part of a whole cell from 0 to 1."""
 
@@ -35,11 +41,15 @@ class Share(NamedTuple):
     part: float
 
 
+Cell = str | Share | Markup
+Rows = list[tuple[Cell, ...]]
+
+
 class Grid(NamedTuple):
     """A table; a row of one cell is a heading of those below it, one that begins with ▶ stands out."""
 
     head: tuple[str, ...]
-    rows: list[tuple[str | Share, ...]]
+    rows: Rows
     title: str = ""
 
 
@@ -56,20 +66,24 @@ class Lines(NamedTuple):
     lines: tuple[str, ...]
 
 
+Block = Paragraph | Grid | Chart | Lines | Markup
+
+
 class Section(NamedTuple):
     """Blocks below a heading; on the page over its whole width, or half of it."""
 
     title: str
-    blocks: list[Paragraph | Grid | Chart | Lines]
+    blocks: list[Block]
     wide: bool = True
 
 
 class Document(NamedTuple):
-    """A report: title, a line about its subject, sections."""
+    """A report: title, a line about its subject, sections; styles of its page beside those of all."""
 
     title: str
     about: str
     sections: list[Section]
+    style: str = ""
 
 
 def parameter_rows(
@@ -114,12 +128,20 @@ def page(document: Document) -> str:
         title=_escaped(document.title),
         about=_escaped(document.about),
         sections="\n".join(map(_section, document.sections)),
+        style=document.style,
     )
 
 
 def _section(section: Section) -> str:
+    heading = f"<h2>{_escaped(section.title)}</h2>" if section.title else ""
+    kind = "wide" if section.wide else "half"
+    return f'<section class="{kind}">{heading}{drawn(section.blocks)}</section>'
+
+
+def drawn(blocks: Iterable[Block]) -> str:
+    """Draw blocks as HTML, charts after all others."""
     parts, charts = [], []
-    for block in section.blocks:
+    for block in blocks:
         if isinstance(block, Chart):
             caption = f"<figcaption>{_escaped(block.caption)}</figcaption>" if block.caption else ""
             charts.append(f"<figure>{plots.svg_text(block.draw())}{caption}</figure>")
@@ -127,13 +149,14 @@ def _section(section: Section) -> str:
             parts.append(_table(block))
         elif isinstance(block, Lines):
             parts.append(f"<ul>{''.join(f'<li>{_escaped(line)}</li>' for line in block.lines)}</ul>")
+        elif isinstance(block, Markup):
+            parts.append(block.html)
         else:
             label = f"<b>{_escaped(block.label)}</b>" if block.label else ""
             parts.append(f'<p class="{block.style}">{label}{_escaped(block.text)}</p>')
     if charts:
         parts.append(f'<div class="charts">{"".join(charts)}</div>')
-    heading = f"<h2>{_escaped(section.title)}</h2>" if section.title else ""
-    return f'<section class="{"wide" if section.wide else "half"}">{heading}{"".join(parts)}</section>'
+    return "".join(parts)
 
 
 def _table(grid: Grid) -> str:
@@ -142,7 +165,7 @@ def _table(grid: Grid) -> str:
     return f'<div class="table"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
 
 
-def _row(cells: tuple[str | Share, ...], columns: int) -> str:
+def _row(cells: tuple[Cell, ...], columns: int) -> str:
     if len(cells) == 1:
         return f'<tr class="over"><th colspan="{columns}">{_escaped(_text(cells[0]))}</th></tr>'
     first, *rest = cells
@@ -152,9 +175,9 @@ def _row(cells: tuple[str | Share, ...], columns: int) -> str:
     return f"<tr{kind}><th>{name}</th>{drawn}</tr>"
 
 
-def _cell(cell: str | Share) -> str:
-    if isinstance(cell, str):
-        return f"<td>{_escaped(cell)}</td>"
+def _cell(cell: Cell) -> str:
+    if not isinstance(cell, Share):
+        return f"<td>{_escaped(cell) if isinstance(cell, str) else cell.html}</td>"
     width = 100.0 * min(max(cell.part, 0.0), 1.0)
     return f'<td class="bar"><i><b style="width:{width:.1f}%"></b></i>{_escaped(cell.text)}</td>'
 
@@ -163,5 +186,5 @@ def _escaped(text: str) -> str:
     return html.escape(text, quote=False)
 
 
-def _text(cell: str | Share) -> str:
-    return cell if isinstance(cell, str) else cell.text
+def _text(cell: Cell) -> str:
+    return cell if isinstance(cell, str) else getattr(cell, "text", "")

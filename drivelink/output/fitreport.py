@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile, effect_entry, link_entry
 from drivelink.output import plots
-from drivelink.output.document import PARAMETER_HEAD, Grid, Lines, Section, Share, parameter_rows
+from drivelink.output.document import PARAMETER_HEAD, Grid, Lines, Rows, Section, parameter_rows
 from drivelink.output.numbers import Units, bare_name, number
 from estimator.batch import TransmissionFit
 from estimator.identify import Identified
@@ -25,7 +25,6 @@ _CURVE_POINTS = 200
 _WIDTH, _HEIGHT = 10.0, 7.0  # inches of a transmission
 _IN_BIN = 15  # rows per median point of the lines through the residuals
 _SHOWN = 3  # parameters beside the curve
-_Rows = list[tuple[str | Share, ...]]
 
 
 def as_json(found: Identified, names: Sequence[str], notes: Iterable[str]) -> dict[str, Any]:
@@ -74,7 +73,7 @@ def sections(found: Identified, names: Sequence[str], units: Units) -> list[Sect
     """Tabulate what was fitted."""
     made = []
     for index, (one, motor) in enumerate(zip(found.fits, found.model.motors, strict=True), start=1):
-        rows: _Rows = []
+        rows: Rows = []
         for name, value in one.parameters.items():
             rows += parameter_rows(name, value, one.std[name], units)
         for name, key in (("inertia_kg_m2", "inertia"), ("viscous_damping_nm_s_rad", "damping")):
@@ -93,7 +92,7 @@ def sections(found: Identified, names: Sequence[str], units: Units) -> list[Sect
         made.append(Section("link", [Grid(PARAMETER_HEAD, rows)]))
     made.append(Section("", [Lines(tuple(found.notes))]))
     if len(names) > 1:
-        each: _Rows = [
+        each: Rows = [
             (name, *(f"{left.rms_nm:.3g} {units.shown('N·m')}  {left.relative:.2%}" for left in one))
             for name, one in zip(names, found.recordings, strict=True)
         ]
@@ -101,7 +100,7 @@ def sections(found: Identified, names: Sequence[str], units: Units) -> list[Sect
     return made
 
 
-def _effects(effects: Iterable[Effect], units: Units) -> _Rows:
+def _effects(effects: Iterable[Effect], units: Units) -> Rows:
     return [
         row
         for effect in effects

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from drivelink.files import write_whole
 from drivelink.output import plots
-from drivelink.output.document import Chart, Grid, Paragraph, Section, Share
+from drivelink.output.document import Chart, Grid, Paragraph, Rows, Section
 from drivelink.output.numbers import Units, in_words
 from estimator.diagnosis.motion import NextMotion
 from estimator.sample import FloatArray
@@ -61,7 +61,7 @@ def section(motion: NextMotion, units: Units) -> Section:
         f"This motion of {motion.time_s[-1]:.3g} s is expected to tell them apart. Record it with the "
         "drive's position loop, and diagnose that recording."
     )
-    rows: list[tuple[str | Share, ...]] = []
+    rows: Rows = []
     for name, now, told, least in zip(
         motion.rivals, motion.now, np.diag(motion.told), _least(motion), strict=True
     ):

@@ -45,9 +45,9 @@ def value_and_interval(value: float, half: float | None, digits: int = 4) -> tup
     return shown(value), shown(half)
 
 
-def with_interval(value: float, half: float | None, unit: str = "", digits: int = 4) -> str:
+def with_interval(value: float, half: float | None, unit: str = "") -> str:
     """`value ± half unit`, with the digits that the interval leaves."""
-    text, interval = value_and_interval(value, half, digits)
+    text, interval = value_and_interval(value, half)
     return f"{text}{f' ± {interval}' if interval else ''} {unit}".rstrip()
 
 

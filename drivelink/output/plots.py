@@ -102,34 +102,24 @@ def over_time(axes: Axes, curves: Mapping[str, PlotCurve], y_label: str, title: 
     xy(axes, curves, "time / s", y_label, title)
 
 
-def stiffness_against_deflection(
-    axes: Axes, curves: Mapping[str, PlotCurve], title: str = "", unit: str = "N·m/rad"
-) -> None:
+def stiffness_against_deflection(axes: Axes, curves: Mapping[str, PlotCurve], title: str = "") -> None:
     """Draw stiffness over deflection: samples in any order become one curve, the median in each bin.
 
     The band is the 95 % interval: 1.96 times the median standard deviation of the bin.
     """
     binned = {name: _binned(curve) for name, curve in curves.items()}
-    x_unit = "rad" if unit.endswith("rad") else "m"
-    xy(axes, binned, f"deflection / {x_unit}", f"stiffness / ({unit})", title)
+    xy(axes, binned, "deflection / rad", "stiffness / (N·m/rad)", title)
 
 
 def save(figure: Figure, path: Path) -> Path:
     """Write the figure in the format of the file name's ending (png, svg, pdf)."""
-    buffer = io.BytesIO()
-    with rc_context(STYLE):
-        metadata = {"Date": None} if path.suffix == ".svg" else None
-        figure.savefig(buffer, format=path.suffix[1:], metadata=metadata)
-    write_whole(path, buffer.getvalue(), force=True)
+    write_whole(path, _drawn(figure, path.suffix[1:]), force=True)
     return path
 
 
 def png(figure: Figure) -> bytes:
     """Return the figure as a PNG picture."""
-    buffer = io.BytesIO()
-    with rc_context(STYLE):
-        figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+    return _drawn(figure, "png")
 
 
 def svg_text(figure: Figure) -> str:
@@ -137,14 +127,19 @@ def svg_text(figure: Figure) -> str:
 
     A page may define `--curve-1`, `--curve-2`, … and `--grid` for a theme of its own.
     """
-    buffer = io.StringIO()
-    with rc_context(STYLE):
-        figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
-    text = buffer.getvalue()
+    text = _drawn(figure, "svg", transparent=True).decode()
     text = text[text.index("<svg") :].replace("<svg", '<svg fill="currentColor"', 1)
     for color, themed in _THEMED.items():
         text = text.replace(f": {color}", f": {themed}")
     return text
+
+
+def _drawn(figure: Figure, kind: str, *, transparent: bool = False) -> bytes:
+    buffer = io.BytesIO()
+    metadata = {"Date": None} if kind == "svg" else None  # reproducible files
+    with rc_context(STYLE):
+        figure.savefig(buffer, format=kind, metadata=metadata, transparent=transparent)
+    return buffer.getvalue()
 
 
 def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> PlotCurve:

@@ -17,11 +17,13 @@ from drivelink.files import write_whole
 from drivelink.output import plots
 from drivelink.output.document import (
     PARAMETER_HEAD,
+    Block,
     Chart,
     Document,
     Grid,
     Lines,
     Paragraph,
+    Rows,
     Section,
     Share,
     page,
@@ -99,22 +101,14 @@ def as_json(outcome: Diagnosis) -> dict[str, Any]:
 
 
 def _effect(finding: Finding, unlisted: Curve | None) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "name": finding.name,
-        "location": finding.location,
-        "parameters": dict(finding.parameters),
-        "std": dict(finding.std),
-        "probability": finding.probability,
-        "alternatives": list(finding.alternatives),
-        "alternative_probabilities": list(finding.alternative_probabilities),
-        "share": finding.share,
-    }
+    entry = asdict(finding)
+    for name, absent in (("motor", None), ("coordinates", ())):
+        if entry[name] == absent:
+            del entry[name]
     if finding.motor is not None:
         entry["motor"] = finding.motor + 1
-    if finding.coordinates:
-        entry["coordinates"] = list(finding.coordinates)
-        if unlisted is not None:
-            entry["curve"] = _points(unlisted)
+    if finding.coordinates and unlisted is not None:
+        entry["curve"] = _points(unlisted)
     return entry
 
 
@@ -156,14 +150,15 @@ def sections(outcome: Diagnosis, units: Units) -> list[Section]:
         Section("What could not be separated, and what would separate it", [_doubts(outcome)]),
     ]
     if outcome.series is not None:
-        charts = partial(_measured_figure, outcome, units), partial(residual_figure, outcome, units)
+        measured = partial(_series_figure, outcome, units, {"measured": "torque_nm"}, "Measured torque")
+        charts = measured, partial(residual_figure, outcome, units)
         made.append(Section("Over time", [Chart(draw) for draw in charts]))
     return [section for section in made if section.blocks]
 
 
 def _errors(outcome: Diagnosis, units: Units) -> Grid:
     unit = units.shown("N·m")
-    rows: list[tuple[str | Share, ...]] = []
+    rows: Rows = []
     for name, one in (("training", outcome.train), ("validation", outcome.validation)):
         before, after = (
             f"{rms:.4g} {unit}, {relative:.2%}"
@@ -178,7 +173,7 @@ def _errors(outcome: Diagnosis, units: Units) -> Grid:
 
 
 def _parameters(outcome: Diagnosis, units: Units) -> Grid:
-    rows: list[tuple[str | Share, ...]] = []
+    rows: Rows = []
     for finding in outcome.effects:
         rows += [(title_of(finding, outcome),)] if finding.parameters else []
         for name, value in finding.parameters.items():
@@ -193,7 +188,7 @@ def _parameters(outcome: Diagnosis, units: Units) -> Grid:
     return Grid(PARAMETER_HEAD, rows)
 
 
-def _candidates(outcome: Diagnosis) -> list[Paragraph | Grid | Chart | Lines]:
+def _candidates(outcome: Diagnosis) -> list[Block]:
     """Each promising effect alone, and why the chosen ones were chosen."""
     if not outcome.rivals:
         return []
@@ -202,7 +197,7 @@ def _candidates(outcome: Diagnosis) -> list[Paragraph | Grid | Chart | Lines]:
               for n, p in zip(f.alternatives, f.alternative_probabilities, strict=True)}  # fmt: skip
     shown = [r for k, r in enumerate(outcome.rivals) if k < _RIVALS or (r.name, r.motor) in chances]
     most = max(rival.error_relative for rival in shown)
-    rows: list[tuple[str | Share, ...]] = []
+    rows: Rows = []
     for rival in shown:
         mine = chances.get((rival.name, rival.motor))
         p = others.get(rival.name) if mine is None else mine
@@ -293,23 +288,18 @@ def _stiffness_figure(curve: StiffnessCurve, units: Units) -> Figure:
     return figure
 
 
-def _measured_figure(outcome: Diagnosis, units: Units) -> Figure:
-    figure, (axes,) = plots.new_figure(width=_COLUMN, height=2.6)
-    if (series := outcome.series) is not None:
-        curve = plots.PlotCurve(series.time_s, series.torque_nm)
-        plots.over_time(axes, {"measured": curve}, units.label("torque / N·m"), "Measured torque")
-    return figure
-
-
 def residual_figure(outcome: Diagnosis, units: Units) -> Figure:
     """Draw what the model leaves of the motor torque over time, before and after; empty without a series."""
+    return _series_figure(outcome, units, {"left before": "before_nm", "left after": "after_nm"}, "Residual")
+
+
+def _series_figure(outcome: Diagnosis, units: Units, names: Mapping[str, str], title: str) -> Figure:
     figure, (axes,) = plots.new_figure(width=_COLUMN, height=2.6)
     if (series := outcome.series) is not None:
         curves = {
-            "left before": plots.PlotCurve(series.time_s, series.before_nm),
-            "left after": plots.PlotCurve(series.time_s, series.after_nm),
+            label: plots.PlotCurve(series.time_s, getattr(series, name)) for label, name in names.items()
         }
-        plots.over_time(axes, curves, units.label("torque / N·m"), "Residual")
+        plots.over_time(axes, curves, units.label("torque / N·m"), title)
     return figure
 
 

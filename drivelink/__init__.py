@@ -31,23 +31,6 @@ if TYPE_CHECKING:
     from drivelink.pubsub.clientbase import joints as joints
     from drivelink.pubsub.feed import State as State
 
-__all__ = [
-    "AsyncSubscription",
-    "Comparison",
-    "Diagnosed",
-    "Fit",
-    "Picture",
-    "State",
-    "Subscription",
-    "__version__",
-    "compare",
-    "diagnose",
-    "fit",
-    "joints",
-    "subscribe",
-    "subscribe_async",
-]
-
 _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
     "AsyncSubscription": "drivelink.pubsub.client",
     "Comparison": "drivelink.output.comparison",
@@ -63,6 +46,8 @@ _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
     "subscribe": "drivelink.pubsub.client",
     "subscribe_async": "drivelink.pubsub.client",
 }
+
+__all__ = ["__version__", *_LAZY]
 
 
 def __getattr__(name: str) -> Any:

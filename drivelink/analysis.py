@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +22,6 @@ from drivelink.output.numbers import Units
 from drivelink.recording.columns import parse_column_map
 from drivelink.recording.corrections import gate
 from drivelink.recording.mapping import joint_of
-from drivelink.version import __version__
 from estimator.diagnosis import Diagnosis
 from estimator.diagnosis import diagnose as _diagnose
 from estimator.diagnosis.motion import NextMotion, design
@@ -147,15 +145,9 @@ class Fit:
                 f"{named}: --write: {harmful}: nothing is written. "
                 "`drivelink diagnose` may say what is missing"
             )
-        spans = [float((one.sequence[-1] - one.sequence[0]) * one.period_s) for one in runs.records]
         provenance = {
             **floor_entry(runs.records, self.found.model, self.found.surplus),
-            "fit": {
-                "recording": runs.named,
-                "seconds": sum(spans),
-                "written": datetime.now(UTC).isoformat(timespec="seconds"),
-                "version": __version__,
-            },
+            "fit": apply_diagnosis.origin(runs.records, runs.named),
         }
         changes = jointfile.changes_to(self.found.model) | {"provenance": provenance}
         jointfile.write_model(runs.source, path, changes, force=force)

@@ -87,20 +87,25 @@ def write(
     model = diagnosed_model(source.joint, outcome)
     provenance = {
         **floor_entry(record, model, outcome.surplus),
-        "diagnosis": {
-            "recording": recording,
-            "seconds": float((record.sequence[-1] - record.sequence[0]) * record.period_s),
-            "verdict": outcome.verdict,
-            "effects": [finding.name for finding in outcome.effects],
-            "bandwidth_hz": outcome.bandwidth_hz,
-            "error_before_relative": outcome.validation.before_relative,
-            "error_after_relative": outcome.validation.after_relative,
-            "written": datetime.now(UTC).isoformat(timespec="seconds"),
-            "version": __version__,
-        },
+        "diagnosis": origin(
+            [record],
+            recording,
+            verdict=outcome.verdict,
+            effects=[finding.name for finding in outcome.effects],
+            bandwidth_hz=outcome.bandwidth_hz,
+            error_before_relative=outcome.validation.before_relative,
+            error_after_relative=outcome.validation.after_relative,
+        ),
     }
     changes = jointfile.changes_to(model) | {"provenance": provenance}
     return jointfile.write_model(source, target, changes, force=force)
+
+
+def origin(records: Sequence[Record], recording: str, **more: Any) -> dict[str, Any]:
+    """Return an entry of [provenance]: from what the model was made, what of it, when."""
+    seconds = sum(float((one.sequence[-1] - one.sequence[0]) * one.period_s) for one in records)
+    written = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"recording": recording, "seconds": seconds, **more, "written": written, "version": __version__}
 
 
 def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:

@@ -130,6 +130,12 @@ class JointText:
     name: str  # for messages
     path: Path | None = None  # the file; None: from a recording
 
+    @property
+    def zenoh_config(self) -> Path | None:
+        """The zenoh configuration that it names."""
+        name = self.joint.zenoh.config
+        return self.folder / name if name else None
+
 
 def load(path: str | Path) -> JointFile:
     """Read and validate a joint file.

@@ -372,6 +372,10 @@ class JointFile(_Section):
             )
         return self
 
+    def timed(self, period_s: float) -> JointFile:
+        """Return the joint with another period of SYNC, s."""
+        return self.model_copy(update={"bus": self.bus.model_copy(update={"period_s": period_s})})
+
     def model(self) -> JointModel:
         """Return the estimator's model of this joint."""
         entry = self.provenance.get("floor")

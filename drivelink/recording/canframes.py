@@ -7,36 +7,27 @@ configuration in the recording.
 from __future__ import annotations
 
 import logging
-from array import array
 from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import chain, islice
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
 from drivelink._core import SYNC_COB_ID, JointPipeline, Tick
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.following import follow_log
-from drivelink.cycle.objectcheck import RecentSamples
-from drivelink.cycle.pipeline import make_assembler
 from drivelink.cycle.syncclock import measure_period
 from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, LoggedFrame, in_order, read_frames
-from drivelink.recording.columns import sample_columns, sample_row
-from drivelink.recording.cycles import Cycle, numbered_ahead, numbered_at_once
+from drivelink.recording.columns import record_of_samples
+from drivelink.recording.cycles import OF_MAPS, OF_SDO, Assembly, Cycle, numbered_ahead, numbered_at_once
 from drivelink.recording.grid import report_gaps
-from drivelink.recording.limits import require_samples
 from drivelink.recording.mapping import recorded_layouts, side_file
 from drivelink.recording.mcapfile import message_fields, read_messages
-from estimator.sample import FloatArray, Record
+from estimator.sample import Record
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_SDO = range(0x581, 0x680)
-_OF_MAPS = frozenset({0, *_SDO, *range(0x701, 0x780)})  # NMT, SDO, boot-up
 _QUIET_SYNCS = 500  # without a change, the configuration has ended
 _MOST_HELD = 1 << 18  # frames among them: more than a bus of 127 nodes sends
 _PEEK = 20_000  # messages that show whether an MCAP file has samples
@@ -97,12 +88,11 @@ class FrameLog:
             self._head, self._frames = [], frames()
         self._check_complete()
         self.period_s = self._period(syncs, joint.bus.period_s)  # the communication cycle, from its SYNCs
-        timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": self.period_s})})
         try:
-            # makes the samples
-            self.assembler = make_assembler(timed, tuple(self._listener.layouts.values()))
+            self._assembly = Assembly(joint.timed(self.period_s), self._listener)
         except DriveError as error:
             raise RecordingError(f"{path}: {error}") from error
+        self.assembler = self._assembly.assembler
 
     def cycles(self) -> Iterator[Cycle]:
         """Yield the cycles of the frames; to be iterated once.
@@ -110,23 +100,7 @@ class FrameLog:
         Raises:
             RecordingError: the recording is damaged, or contains no sample.
         """
-        assembler = self.assembler
-        stamp_now = stamp_before = 0
-
-        def feed(can_id: int, data: bytes, jump: int, stamp_ns: int) -> Cycle | None:
-            nonlocal stamp_now, stamp_before
-            was = assembler.sequence
-            sample = assembler.feed(can_id, data, jump)
-            if can_id == SYNC_COB_ID and jump > 0:
-                stamp_before, stamp_now = stamp_now, stamp_ns
-            if sample is not None:
-                stamp_ns = stamp_before if assembler.sequence != was else stamp_now
-                return Cycle(sample.sequence, stamp_ns, sample, assembler.flags)
-            if can_id == SYNC_COB_ID and jump and (missed := assembler.missed) >= 0:
-                return Cycle(missed, stamp_before, None, assembler.flags)
-            return None
-
-        return self._fed(feed)
+        return self._fed(self._assembly.cycle)
 
     def ticks(self, pipeline: JointPipeline) -> Iterator[Tick]:
         """Yield the published output of the cycles; to be iterated once.
@@ -138,23 +112,18 @@ class FrameLog:
 
     def _fed(self, feed: Callable[[int, bytes, int, int], _Fed | None]) -> Iterator[_Fed]:
         """Pass the frames through the assembler."""
-        assembler = self.assembler
-        recent = RecentSamples(self.period_s)
-        follower = follow_log(self._listener, self.assembler, recent)
+        assembly, heard, samples = self._assembly, set(), False
         numbered = numbered_at_once if self._follow else numbered_ahead
-        heard: set[int] = set()
-        samples = False
         for (stamp_ns, can_id, data, _), jump in numbered(chain(self._head, self._frames), self.period_s):
             fed = feed(can_id, data, jump, stamp_ns)
             heard.add(can_id)
-            if fed is not None and fed.sample is not None:
-                recent.add(fed.sample)
-                samples = True
-            if can_id in _OF_MAPS or can_id == SYNC_COB_ID:
-                follower.feed(can_id, data, _seconds(stamp_ns, assembler.sequence, self.period_s))
+            sample = None if fed is None else fed.sample
+            samples |= sample is not None
+            now_s = _seconds(stamp_ns, assembly.assembler.sequence, self.period_s)
+            assembly.follow(can_id, data, sample, now_s)
             if fed is not None:
                 yield fed
-        doubts = list(follower.doubts.values())
+        doubts = list(assembly.follower.doubts.values())
         if not samples:
             why = f": {doubts[0]}" if doubts else self._absent(heard)
             raise RecordingError(f"{self._path}: no complete sample in it{why}")
@@ -195,7 +164,7 @@ class FrameLog:
                 quiet += 1
                 if quiet > _QUIET_SYNCS and not listener.busy:
                     break
-            elif can_id in (_OF_MAPS if self._passive else _SDO) and (listener.busy or not self._passive):
+            elif can_id in (OF_MAPS if self._passive else OF_SDO) and (listener.busy or not self._passive):
                 now_s = _seconds(stamp_ns, len(syncs), listener.bus.period_s)
                 listener.feed(can_id, data, now_s)
                 if listener.poll(now_s):
@@ -242,36 +211,10 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
     if joint is None:
         raise RecordingError(f"{path}: a raw CAN recording needs the joint file that says what is in it")
     log = FrameLog(path, joint, base_dir, channel)
-    motors = len(joint.motor)
-    sequence, values = array("q"), array("d")
-    for cycle in log.cycles():
-        if (sample := cycle.sample) is not None:
-            sequence.append(sample.sequence)
-            values.extend(sample_row(sample, log.period_s))
-            require_samples(sample.sequence - sequence[0] + 1, str(path))
-    if len(sequence) < 3:
-        raise RecordingError(f"{path}: expected at least 3 complete samples, got {len(sequence)}")
-    number = np.frombuffer(sequence, dtype=np.int64)
-    report_gaps(number, log.period_s, str(path))
-    names = sample_columns(motors)
-    table = np.frombuffer(values, dtype=np.float64).reshape(-1, len(names))
-    columns = {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(names)}
-
-    def motor(name: str) -> FloatArray:
-        return np.stack([columns[f"motor{i}_{name}"] for i in range(1, motors + 1)], axis=1)
-
-    def known(column: FloatArray) -> FloatArray | None:
-        return column if np.any(np.isfinite(column)) else None
-
-    return Record(
-        period_s=log.period_s,
-        sequence=number,
-        motor_position_rad=motor("position_rad"),
-        motor_torque_nm=motor("torque_nm"),
-        motor_velocity_rad_s=known(motor("velocity_rad_s")),
-        link_position_rad=known(columns["link_position_rad"]),
-        link_velocity_rad_s=known(columns["link_velocity_rad_s"]),
-    )
+    samples = (cycle.sample for cycle in log.cycles() if cycle.sample is not None)
+    record = record_of_samples(samples, len(joint.motor), log.period_s, str(path))
+    report_gaps(record.sequence, log.period_s, str(path))
+    return record
 
 
 def _seconds(stamp_ns: int, sync: int, period_s: float) -> float:

@@ -247,7 +247,7 @@ class _Lines:
             if line.isspace() or line.lstrip().startswith((b"#", b";")):
                 continue
             try:
-                frame = self._either(line) if len(line) <= _LINE else _no_frame()
+                frame = self._either(line)
             except ValueError:
                 self.strange += 1
                 shown = repr(line.strip()[:60].decode(errors="replace"))
@@ -261,6 +261,8 @@ class _Lines:
 
     def _either(self, line: bytes) -> LoggedFrame | None:
         """The frame, first in the format of the previous line."""
+        if len(line) > _LINE:
+            raise ValueError
         try:
             return self._parse(line)
         except ValueError:
@@ -268,21 +270,12 @@ class _Lines:
             return self._parse(line)
 
 
-def _no_frame() -> LoggedFrame:
-    raise ValueError
-
-
 def _compact(line: bytes) -> LoggedFrame | None:
     match = _COMPACT.match(line) or _COMPACT.match(_undated(line))
     if match is None:
         raise ValueError
     seconds, fraction, channel, can_id, _fd_flags, data, remote = match.groups()
-    if len(can_id) == _EXTENDED_DIGITS or int(can_id, 16) > _LAST_ID or remote:
-        return None
-    payload = bytes.fromhex(data.replace(b".", b"").decode())
-    if len(payload) > _LONGEST:
-        return None
-    return LoggedFrame(_stamp(seconds, fraction), int(can_id, 16), payload, channel.decode(errors="replace"))
+    return None if remote else _frame(seconds, fraction, channel, can_id, data.replace(b".", b""))
 
 
 def _spaced(line: bytes) -> LoggedFrame | None:
@@ -290,15 +283,22 @@ def _spaced(line: bytes) -> LoggedFrame | None:
     if match is None:
         raise ValueError
     seconds, fraction, channel, can_id, length, data, rest = match.groups()
-    if len(can_id) == _EXTENDED_DIGITS or int(can_id, 16) > _LAST_ID or int(length) > _LONGEST:
+    if rest.startswith((b"remote", b"ERRORFRAME")) or int(length) > _LONGEST:
         return None
-    if rest.startswith((b"remote", b"ERRORFRAME")):
-        return None
-    payload = bytes.fromhex(data.decode())
-    if len(payload) < int(length):
+    data = b"".join(data.split()[: int(length)])  # the characters that -a appends may look like bytes
+    frame = _frame(seconds, fraction, channel, can_id, data)
+    if frame is not None and len(frame.data) < int(length):
         raise ValueError
-    # The characters that -a appends may look like bytes.
-    payload = payload[: int(length)]
+    return frame
+
+
+def _frame(
+    seconds: bytes | None, fraction: bytes, channel: bytes, can_id: bytes, data: bytes
+) -> LoggedFrame | None:
+    """A frame of its texts; None: it is none of CANopen's."""
+    payload = bytes.fromhex(data.decode())
+    if len(can_id) == _EXTENDED_DIGITS or int(can_id, 16) > _LAST_ID or len(payload) > _LONGEST:
+        return None
     return LoggedFrame(_stamp(seconds, fraction), int(can_id, 16), payload, channel.decode(errors="replace"))
 
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import difflib
 import logging
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,6 +124,42 @@ def sample_row(sample: Sample, period_s: float) -> tuple[float, ...]:
     )
 
 
+def record_of_samples(samples: Iterable[Sample], motors: int, period_s: float, where: str) -> Record:
+    """Make a record of samples; a channel without a finite value is left out.
+
+    Raises:
+        RecordingError: fewer than three samples, or more periods from first to last than fit into memory.
+    """
+    names = ("sequence", *sample_columns(motors)[1:])
+
+    def rows() -> Iterator[tuple[float, ...]]:
+        first = None
+        for sample in samples:
+            first = sample.sequence if first is None else first
+            require_samples(sample.sequence - first + 1, where)
+            yield (float(sample.sequence), *sample_row(sample, period_s)[1:])
+
+    table = np.fromiter(rows(), dtype=np.dtype((np.float64, len(names))))
+    if len(table) < 3:
+        raise RecordingError(f"{where}: expected at least 3 complete samples, got {len(table)}")
+    columns = dict(zip(names, table.T, strict=True))
+
+    def motor(name: str) -> FloatArray:
+        return np.stack([columns[f"motor{i}_{name}"] for i in range(1, motors + 1)], axis=1)
+
+    velocity = motor("velocity_rad_s")
+    known = (name for name in OF_LINK if np.any(np.isfinite(columns[name])))
+    link: dict[str, Any] = {name: np.ascontiguousarray(columns[name]) for name in known}
+    return Record(
+        period_s=period_s,
+        sequence=columns["sequence"].astype(np.int64),
+        motor_position_rad=motor("position_rad"),
+        motor_torque_nm=motor("torque_nm"),
+        motor_velocity_rad_s=velocity if np.any(np.isfinite(velocity)) else None,
+        **link,
+    )
+
+
 def record_from_columns(
     columns: Mapping[str, FloatArray],
     where: str,
@@ -211,18 +247,15 @@ def _on_grid(
         again = resampled(measured, rows)
         return again, find_grid(again["time_s"], where, nominal_s)
     if grid is None:
-        raise RecordingError(f"{refused}{_renumber(where, nominal_s or _mean_step(columns['time_s']))}")
+        known = columns["time_s"][np.isfinite(columns["time_s"])]
+        period_s = nominal_s or float(known[-1] - known[0]) / (len(known) - 1)
+        raise RecordingError(f"{refused}{_renumber(where, period_s)}")
     _LOG.warning(
         "%s: the stamps jitter by up to %.2g periods: taken as arrival times of a uniform sampling",
         where,
         grid.jittering,
     )
     return columns, grid
-
-
-def _mean_step(time_s: FloatArray) -> float:
-    known = time_s[np.isfinite(time_s)]
-    return float(known[-1] - known[0]) / (len(known) - 1)
 
 
 def _renumber(where: str, period_s: float) -> str:
@@ -259,7 +292,9 @@ def _channels(
     if "link_position_rad" not in link and joint and joint.model().has_deflection:
         _needed(columns, "link_position_rad", where)
     for i, position in zip(numbers, positions, strict=True):
-        _report_constant(f"motor{i}_position_rad", position, where)
+        if np.nanmin(position) == np.nanmax(position):
+            name = f"motor{i}_position_rad"
+            _LOG.warning("%s: %s never changes: nothing moved, or the signal is not connected", where, name)
     return _Channels(positions, torques, velocities if any(v is not None for v in measured) else [], link)
 
 
@@ -326,10 +361,10 @@ def _torque(
 
 def _needed(columns: Mapping[str, FloatArray], name: str, where: str, other: str = "") -> FloatArray:
     _require(columns, name, where, other)
-    values = columns[name]
-    if not np.any(np.isfinite(values)):
+    values = _optional(columns, name)
+    if values is None:
         raise RecordingError(f"{where}: column {name} holds no numeric value")
-    return np.where(np.isfinite(values), values, np.nan)
+    return values
 
 
 def _require(columns: Mapping[str, FloatArray], name: str, where: str, other: str = "") -> None:
@@ -344,9 +379,3 @@ def _some(names: Sequence[str]) -> str:
     """Some names, for a message."""
     more = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
     return ", ".join(name[:40] for name in names[:_SHOWN]) + more
-
-
-def _report_constant(name: str, values: FloatArray, where: str) -> None:
-    finite = values[np.isfinite(values)]
-    if len(finite) and float(np.ptp(finite)) == 0.0:
-        _LOG.warning("%s: %s never changes: nothing moved, or the signal is not connected", where, name)

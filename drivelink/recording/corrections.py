@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from drivelink.errors import RecordingError
 from drivelink.jointfile import DriveSection, EncoderSection, JointFile
 from drivelink.recording.canframes import is_frame_log
+from drivelink.recording.columns import record_of_samples
 from drivelink.recording.limits import MAX_SAMPLES
 from drivelink.recording.playback import Played
 from estimator.errors import EstimatorError
@@ -74,29 +75,19 @@ class Gathered:
         self._most = round(_LONGEST_S / period_s)
         self._samples: list[Sample] = []
 
-    def add(self, sample: Sample) -> None:
-        """Add a sample."""
-        if len(self._samples) < self._most:
-            self._samples.append(sample)
-
     def take(self, played: Played) -> None:
         """Add a cycle of a replay."""
         sample = played.tick.sample if len(self._samples) < self._most else None
         if sample is not None:
             self._samples.append(sample)
 
-    def judgement(self) -> Judgement:
-        """Judge units and signs of the samples."""
-        model = self._joint.model()
-        record = _record_of(self._samples, model, self._period_s)
-        return (
-            Judgement(reason="no samples in one run of numbers") if record is None else judge(record, model)
-        )
-
     def remarks(self, *, live: bool) -> list[str]:
         """Return findings with corrections, or what the motion does not reveal, one line each."""
+        model, judgement = self._joint.model(), Judgement(reason="no samples in one run of numbers")
         try:
-            judgement = self.judgement()
+            record = _record_of(self._samples, model, self._period_s)
+            if record is not None:
+                judgement = judge(record, model)
         except EstimatorError as error:
             return [f"units and signs cannot be checked: {error}"]
         decided = not judgement.findings and not judgement.undecided
@@ -109,17 +100,13 @@ def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) ->
     linked = model.has_deflection
     rows = [s for s in rows if not linked or math.isfinite(s.link_position_rad)]
     sequence = np.array([s.sequence for s in rows], dtype=np.int64)
-    if len(rows) < 2 or np.any(np.diff(sequence) < 1):  # restarted numbering: two runs in one file
+    if len(rows) < 3 or np.any(np.diff(sequence) < 1):  # restarted numbering: two runs in one file
         return None
     if sequence[-1] - sequence[0] > MAX_SAMPLES:  # the judge allocates the gaps
         return None
-    return Record(
-        period_s=period_s,
-        sequence=sequence,
-        motor_position_rad=np.array([s.motor_position_rad for s in rows]),
-        motor_torque_nm=np.array([s.motor_torque_nm for s in rows]),
-        link_position_rad=np.array([s.link_position_rad for s in rows]) if linked else None,
-    )
+    record = record_of_samples(rows, len(model.motors), period_s, "samples")
+    link = record.link_position_rad if linked else None
+    return replace(record, motor_velocity_rad_s=None, link_position_rad=link)
 
 
 def _text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -> str:

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from typing import NamedTuple
 
-from drivelink._core import SYNC_COB_ID, Assembler, JointPipeline, Tick
+from drivelink._core import SYNC_COB_ID, JointPipeline, Tick
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.following import MapFollower, follow_log
+from drivelink.cycle.following import follow_log
 from drivelink.cycle.objectcheck import RecentSamples
 from drivelink.cycle.pipeline import make_assembler
 from drivelink.cycle.syncclock import SyncClock, measure_period
@@ -23,6 +23,8 @@ from drivelink.recording.canlog import NO_STAMP, LoggedFrame
 from estimator.sample import Sample
 
 _BATCH = 512
+OF_SDO = range(0x581, 0x680)
+OF_MAPS = frozenset({0, *OF_SDO, *range(0x701, 0x780)})  # NMT, SDO, boot-up
 
 
 class Cycle(NamedTuple):
@@ -39,29 +41,21 @@ def estimated(cycles: Iterable[Cycle], pipeline: JointPipeline) -> Iterator[Tick
 
     Reading and estimating alternate in batches, which is faster than per cycle.
     """
-    for batch in batches(cycles):
-        for cycle in batch:
-            sequence, stamp_ns, sample, flags = cycle
-            if sample is not None:
-                yield pipeline.take(sample, flags, stamp_ns)
-            elif (tick := pipeline.carry_on(sequence, flags, stamp_ns)) is not None:
-                yield tick
-
-
-def batches(cycles: Iterable[Cycle]) -> Iterator[list[Cycle]]:
-    """Yield lists of cycles; before an error of the recording, those up to it."""
     source = iter(cycles)
     error: DrivelinkError | None = None
     while error is None:
         batch: list[Cycle] = []
         try:
             batch.extend(islice(source, _BATCH))
-        except DrivelinkError as broken:
+        except DrivelinkError as broken:  # raised after what came before it
             error = broken
-        if batch:
-            yield batch
-        elif error is None:
+        if not batch and error is None:
             return
+        for sequence, stamp_ns, sample, flags in batch:
+            if sample is not None:
+                yield pipeline.take(sample, flags, stamp_ns)
+            elif (tick := pipeline.carry_on(sequence, flags, stamp_ns)) is not None:
+                yield tick
     raise error
 
 
@@ -152,6 +146,44 @@ class SyncNumbering:
         return 1 + lost
 
 
+class Assembly:
+    """Makes the cycles of numbered frames, and follows what else they say of the nodes' mapping.
+
+    Args:
+        joint: with the period of SYNC.
+        listener: knows the mapping of its nodes.
+
+    Raises:
+        DriveError: the mapping lacks a signal.
+    """
+
+    def __init__(self, joint: JointFile, listener: PassiveConfigurator) -> None:
+        self.assembler = make_assembler(joint, tuple(listener.layouts.values()))  # makes the samples
+        self._recent = RecentSamples(joint.bus.period_s)
+        self.follower = follow_log(listener, self.assembler, self._recent)
+        self._stamp_ns = self._before_ns = 0  # of the newest SYNC, and of the one before
+
+    def cycle(self, can_id: int, data: bytes, jump: int, stamp_ns: int) -> Cycle | None:
+        """Take a frame; return the cycle that it ends, if any."""
+        assembler = self.assembler
+        sample = assembler.feed(can_id, data, jump)
+        if can_id == SYNC_COB_ID and jump > 0:
+            self._before_ns, self._stamp_ns = self._stamp_ns, stamp_ns
+        if sample is not None:
+            at_ns = self._before_ns if sample.sequence != assembler.sequence else self._stamp_ns
+            return Cycle(sample.sequence, at_ns, sample, assembler.flags)
+        if can_id == SYNC_COB_ID and jump and (missed := assembler.missed) >= 0:
+            return Cycle(missed, self._before_ns, None, assembler.flags)
+        return None
+
+    def follow(self, can_id: int, data: bytes, sample: Sample | None, now_s: float) -> None:
+        """Compare a frame with the mapping, after its cycle was made."""
+        if sample is not None:
+            self._recent.add(sample)
+        if can_id in OF_MAPS or can_id == SYNC_COB_ID:
+            self.follower.feed(can_id, data, now_s)
+
+
 class FrameSamples:
     """Takes frames in bus order and makes the samples of one joint, as its daemon would.
 
@@ -162,11 +194,8 @@ class FrameSamples:
     def __init__(self, joint: JointFile, listener: PassiveConfigurator) -> None:
         self._joint, self._listener = joint, listener
         self._numbering = SyncNumbering(joint.bus.period_s, measure=True)
-        self._recent = RecentSamples(joint.bus.period_s)
-        self._assembler: Assembler | None = None
-        self._follower: MapFollower | None = None
+        self._assembly: Assembly | None = None
         self._lacking = ""  # missing parts of a known mapping
-        self._stamp_ns = 0
 
     @property
     def period_s(self) -> float:
@@ -176,13 +205,7 @@ class FrameSamples:
     @property
     def joint(self) -> JointFile:
         """The joint, with the measured period of SYNC."""
-        bus = self._joint.bus.model_copy(update={"period_s": self.period_s})
-        return self._joint.model_copy(update={"bus": bus})
-
-    @property
-    def assembling(self) -> bool:
-        """Whether samples can be made: the mapping is known."""
-        return self._assembler is not None
+        return self._joint.timed(self.period_s)
 
     @property
     def missing(self) -> str:
@@ -199,38 +222,27 @@ class FrameSamples:
         return self._made(self._numbering.rest())
 
     def _made(self, numbered: list[tuple[LoggedFrame, int]]) -> list[tuple[Sample, int]]:
-        return [made for frame, jump in numbered if (made := self._assemble(frame, jump)) is not None]
+        found = []
+        for (stamp_ns, can_id, data, _), jump in numbered:
+            assembly = self._assembly or self._begun(can_id, data, stamp_ns * 1e-9)
+            if assembly is not None:
+                made = assembly.cycle(can_id, data, jump, stamp_ns)
+                sample = None if made is None else made.sample
+                assembly.follow(can_id, data, sample, stamp_ns * 1e-9)
+                found += [] if made is None or sample is None else [(sample, made.stamp_ns)]
+        return found
 
-    def _assemble(self, frame: LoggedFrame, jump: int) -> tuple[Sample, int] | None:
-        stamp_ns, cob_id, data, _ = frame
-        if self._assembler is None and not self._begin(cob_id, data, stamp_ns * 1e-9):
-            return None
-        assert self._assembler is not None and self._follower is not None
-        before_ns = self._stamp_ns
-        if cob_id == SYNC_COB_ID and jump > 0:
-            self._stamp_ns = stamp_ns
-        sample = self._assembler.feed(cob_id, data, jump)
-        if sample is not None:
-            self._recent.add(sample)
-        self._follower.feed(cob_id, data, stamp_ns * 1e-9)
-        if sample is None:
-            return None
-        return sample, before_ns if sample.sequence != self._assembler.sequence else self._stamp_ns
-
-    def _begin(self, cob_id: int, data: bytes, now_s: float) -> bool:
-        """Take the mapping from a frame; return whether that of every node is known now."""
+    def _begun(self, can_id: int, data: bytes, now_s: float) -> Assembly | None:
+        """Take the mapping from a frame; None: that of some node is not known yet."""
         listener, passive = self._listener, not self._joint.bus.configure
         if self._lacking:
-            return False
-        if 0x581 <= cob_id <= 0x67F or (passive and (cob_id == 0 or cob_id >= 0x700)):
-            listener.feed(cob_id, data, now_s)
+            return None
+        if can_id in (OF_MAPS if passive else OF_SDO):
+            listener.feed(can_id, data, now_s)
             listener.poll(now_s)
-        if listener.busy:
-            return False
-        try:
-            self._assembler = make_assembler(self.joint, tuple(listener.layouts.values()))
-        except DriveError as error:
-            self._lacking = str(error)
-            return False
-        self._follower = follow_log(listener, self._assembler, self._recent)
-        return True
+        if not listener.busy:
+            try:
+                self._assembly = Assembly(self.joint, listener)
+            except DriveError as error:
+                self._lacking = str(error)
+        return self._assembly

@@ -56,6 +56,15 @@ def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
 
 
+def first_row(path: Path, names: ColumnMap) -> dict[str, FloatArray]:
+    """Read the known columns of the first row, as `read_csv_columns` does of all."""
+    with open_regular(path) as file:
+        header, line = _header(file, path)
+        layout = _layout(header, path, names)
+        table = _numbers(layout.with_commas(file.readline(MAX_LINE_BYTES)), layout, path, line)
+    return dict(zip(layout.used, table.T, strict=True))
+
+
 def _read(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     header, first_line = _header(file, path)
     layout = _layout(header, path, names)

@@ -14,9 +14,10 @@ import struct
 import zlib
 from array import array
 from collections.abc import Generator, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
@@ -74,36 +75,20 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
         RecordingError: it cannot be read, is not an MCAP file, or has a record larger than `MAX_BLOCK_BYTES`.
     """
     channels: dict[int, str | None] = {}
-    try:
-        with open_regular(path) as file:
-            if file.read(len(_MAGIC)) != _MAGIC:
-                raise RecordingError(f"{path}: expected an MCAP file, its first bytes are not those of one")
-            size = os.fstat(file.fileno()).st_size
-            left, unpacked, most = size - len(_MAGIC), 0, most_records(size)
-            while len(head := file.read(_HEAD.size)) == _HEAD.size:
-                opcode, length = _HEAD.unpack(head)
-                left -= _HEAD.size + length
-                if opcode in (_DATA_END, _FOOTER):
-                    return
-                if left < 0:  # truncated, or a damaged length
-                    break
-                if opcode not in _WANTED:  # indexes, attachments, metadata: not read here
-                    file.seek(length, os.SEEK_CUR)
-                    continue
-                _require_size(length, path)
-                body = file.read(length)
-                records = _decompressed(body, path) if opcode == _CHUNK_OP else head + body
+    with _opened(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        unpacked, most = 0, most_records(size)
+        try:
+            for opcode, record in _records(file, path, _WANTED):
+                records = _decompressed(record[_HEAD.size :], path) if opcode == _CHUNK_OP else record
                 unpacked += len(records)
                 if unpacked > _MOST_RATIO * size + _SMALL_BYTES:
                     raise RecordingError(
                         f"{path}: expected to unpack to at most {_MOST_RATIO} times its size"
                     )
                 most -= yield from _messages(records, channels, topics, most, path)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    except _BrokenError:
-        pass
-    _warn_once(path, path.stat().st_mtime_ns)
+        except _BrokenError:
+            _warn_once(path, path.stat().st_mtime_ns)
 
 
 def read_attachment(path: Path, name: str) -> bytes | None:
@@ -112,27 +97,47 @@ def read_attachment(path: Path, name: str) -> bytes | None:
     Raises:
         RecordingError: the file cannot be read, or the attachment is larger than `MAX_BLOCK_BYTES`.
     """
+    with _opened(path) as file, suppress(_BrokenError, struct.error):
+        for _, record in _records(file, path, frozenset({_ATTACHMENT})):
+            found, data = _attached(record[_HEAD.size :])
+            if found == name:
+                return data
+    return None
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
+    """The file behind its first bytes."""
     try:
         with open_regular(path) as file:
-            left = os.fstat(file.fileno()).st_size - len(_MAGIC)
-            file.seek(len(_MAGIC))
-            while len(head := file.read(_HEAD.size)) == _HEAD.size:
-                opcode, length = _HEAD.unpack(head)
-                left -= _HEAD.size + length
-                if left < 0 or opcode == _DATA_END:
-                    return None
-                if opcode != _ATTACHMENT:
-                    file.seek(length, os.SEEK_CUR)
-                    continue
-                _require_size(length, path)
-                found, data = _attached(file.read(length))
-                if found == name:
-                    return data
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise RecordingError(f"{path}: expected an MCAP file, its first bytes are not those of one")
+            yield file
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    except struct.error:
-        pass
-    return None
+
+
+def _records(file: IO[bytes], path: Path, wanted: frozenset[int]) -> Iterator[tuple[int, bytes]]:
+    """Yield opcode and bytes of some records, those of indexes and metadata skipped.
+
+    Raises:
+        _BrokenError: the file is truncated, or a length is damaged.
+        RecordingError: one is larger than `MAX_BLOCK_BYTES`.
+    """
+    left = os.fstat(file.fileno()).st_size - len(_MAGIC)
+    while len(head := file.read(_HEAD.size)) == _HEAD.size:
+        opcode, length = _HEAD.unpack(head)
+        left -= _HEAD.size + length
+        if opcode in (_DATA_END, _FOOTER):
+            return
+        if left < 0:
+            break
+        if opcode in wanted:
+            _require_size(length, path)
+            yield opcode, head + file.read(length)
+        else:
+            file.seek(length, os.SEEK_CUR)
+    raise _BrokenError
 
 
 def _attached(body: bytes) -> tuple[str, bytes]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from array import array
 from pathlib import Path
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from drivelink.errors import RecordingError
-from drivelink.files import NewFile
 from drivelink.output.numbers import with_interval
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.recording.messages import (
@@ -22,6 +20,7 @@ from drivelink.recording.messages import (
     external_row,
 )
 from drivelink.recording.playback import Played
+from drivelink.recording.sinks import SafeFile
 from estimator.online import Estimator
 from estimator.reasons import why_not_valid
 from estimator.sample import SIGMA_95, FloatArray, Status
@@ -61,46 +60,31 @@ class EstimatesFile:
     ) -> None:
         columns = _columns(motors) + (external_columns() if linked else ())
         self._linked, self._estimator = linked, estimator
-        self._path = path
         self._line = ",".join(["%r"] * len(columns)) + "\n"
         self._rows = [",".join(columns) + "\n"]
-        try:
-            self._file = NewFile(path, force=force)
-        except OSError as error:
-            raise self._failed(error) from error
+        self._file = SafeFile(path, force=force)
 
     def take(self, played: Played) -> None:
         """Write one row."""
-        tick = played.tick
         row = _row(played, self._estimator)
-        self._rows.append(self._line % (row + external_row(tick.external) if self._linked else row))
+        self._rows.append(self._line % (row + external_row(played.tick.external) if self._linked else row))
         if len(self._rows) >= _ROWS:
             self._write()
 
     def close(self) -> None:
         """Place the file, unless writing has failed."""
-        if self._file.fd < 0:
-            return
-        try:
+        if not self._file.closed:
             self._write()
-            self._file.place()
-        except OSError as error:
-            raise self._failed(error) from error
-        finally:
             self._file.close()
 
     def _write(self) -> None:
-        rest = memoryview("".join(self._rows).encode("ascii"))
+        self._file.write("".join(self._rows).encode("ascii"))
         self._rows.clear()
         try:
-            while rest:
-                rest = rest[os.write(self._file.fd, rest) :]
-        except OSError as error:
-            self._file.close()
-            raise self._failed(error) from error
-
-    def _failed(self, error: OSError) -> RecordingError:
-        return RecordingError(f"{self._path}: cannot be written: {error.strerror}")
+            self._file.flush()
+        except RecordingError:
+            self._file.abandon()
+            raise
 
 
 class Publication:

@@ -46,9 +46,10 @@ class Playback:
         self.motors = len(joint.motor)  # number of motors
         self.period_s = period_s  # of recording and estimator
         self.total = total  # number of cycles, if known
-        timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": period_s})})
         # Without an assembler its input are samples.
-        self.pipeline = JointPipeline(assembler or Assembler((), 0), *build(timed))  # their pipeline
+        self.pipeline = JointPipeline(
+            assembler or Assembler((), 0), *build(joint.timed(period_s))
+        )  # their pipeline
         self._cycles = cycles
 
     def __iter__(self) -> Iterator[Played]:

@@ -68,7 +68,6 @@ class ZenohTap:
         self._gate = gate or FirstSource(sink)
         self.missed = 0  # cycles without sample
         self._impossible = 0
-        self.newest_s = 0.0  # UNIX time of the newest sample, or 0
         self._sequence = -1
         self._motors = len(joint.motor)
         self._identity = DaemonIdentity()
@@ -76,15 +75,11 @@ class ZenohTap:
         key = f"{joint.zenoh.prefix}/{joint.name}"
         ring = zenoh.handlers.RingChannel
         history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
-        wanted: dict[str, Callable[[zenoh.Sample], None]] = {}
-        if "sample" in sink.wants:
-            wanted["sample"] = self._sample
-        if "estimate" in sink.wants:
-            wanted["estimate"] = self._estimate
-        if "external" in sink.wants:
-            wanted["external"] = self._external
+        takers = {"sample": self._sample, "estimate": self._estimate, "external": self._external}
         self._streams: list[tuple[Any, Callable[[zenoh.Sample], None]]] = [
-            (session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)), take) for name, take in wanted.items()
+            (session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)), take)
+            for name, take in takers.items()
+            if name in sink.wants
         ]
         if "snapshot" in sink.wants:
             plain = session.declare_subscriber(f"{key}/snapshot", ring(_SNAPSHOTS))
@@ -133,7 +128,6 @@ class ZenohTap:
         if self._sequence >= 0 and step > 1:
             self.missed += step - 1
         self._sequence = sample.sequence
-        self.newest_s = stamp_ns * 1e-9
         self._gate.sample(self, sample, stamp_ns)
 
     def _estimate(self, message: zenoh.Sample) -> None:
@@ -188,11 +182,6 @@ class BusTap:
             self._samples = FrameSamples(joint, listener)
         self._period_s = joint.bus.period_s  # as said last
         self.frames = 0  # received so far
-
-    @property
-    def assembling(self) -> bool:
-        """Whether samples are made."""
-        return self._samples is not None and self._samples.assembling
 
     @property
     def missing(self) -> str:

@@ -9,6 +9,7 @@ import io
 import json
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,7 @@ class SafeFile(io.BufferedIOBase):
         """Write all pending bytes as one block."""
         if self._file.fd < 0 or not self._pending:
             return
-        self._put(bytes(self._pending), self._size)
+        self._put(bytes(self._pending), None)
         self._size += len(self._pending)
         self._pending.clear()
 
@@ -123,15 +124,18 @@ class SafeFile(io.BufferedIOBase):
         self._file.close()
         super().close()
 
-    def _put(self, data: bytes, offset: int) -> None:
+    def _put(self, data: bytes, place: int | None) -> None:
+        """Write bytes at a place, or at the end."""
         fd, done = self._file.fd, 0
         try:
             while done < len(data):
-                done += os.pwrite(fd, data[done:], offset + done)
+                rest = data[done:]
+                done += os.write(fd, rest) if place is None else os.pwrite(fd, rest, place + done)
         except OSError as error:
             self._pending.clear()
-            if offset >= self._size:
-                os.ftruncate(fd, self._size)
+            if place is None:
+                with suppress(OSError):  # of a pipe
+                    os.ftruncate(fd, self._size)
             raise self._failed(error) from error
 
     def _failed(self, error: OSError) -> RecordingError:

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from estimator.freerun import free_run, nrmse_fit
 PERIOD_S = 0.001
 SPRING = {"k_nm_rad": 8.0}
 FRICTION = Effect(name="coulomb_friction", parameters={"torque_nm": 0.05, "smoothing_rad_s": 1e-3})
-EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 def joint(**motor: object) -> JointModel:
@@ -91,24 +89,16 @@ def test_what_cannot_be_simulated_is_one_line_and_the_fit_figure_is_that_of_matl
 
 
 @pytest.mark.slow
-def test_three_lines_fit_predict_plot_and_write(tmp_path):
-    sys.path.insert(0, str(EXAMPLES))
-    try:
-        from close_the_loop import JOINT
-        from close_the_loop import record as recorded
-    finally:
-        sys.path.remove(str(EXAMPLES))
-    for number, name in enumerate(("run.csv", "other.csv")):
-        recorded(tmp_path / name, 5.0, run=number)
-    fit = drivelink.fit(tmp_path / "run.csv", joint=JOINT)
-    predicted = fit.predict(tmp_path / "other.csv", 0.05)
-    assert min(predicted.fit_percent.values()) > 80.0
+def test_three_lines_fit_predict_plot_and_write(fleet, tmp_path):
+    run, other = (fleet / "recordings" / f"elbow-2026-01-0{day}.csv" for day in (5, 6))
+    fit = drivelink.fit(run, joint=fleet / "joints" / "elbow.toml")
+    assert min(fit.predict(other, 0.05).fit_percent.values()) > 80.0
     assert fit.plot()._repr_png_().startswith(b"\x89PNG")
     better = fit.write(tmp_path / "better.toml")
     assert "covariance" in better.read_text(encoding="utf-8")
     with pytest.raises(DrivelinkError, match="exists"):
         fit.write(better)
-    found = drivelink.diagnose(tmp_path / "other.csv", joint=better)
+    found = drivelink.diagnose(other, joint=better)
     assert str(found).startswith("The model is sufficient")
     assert found.plot()._repr_png_().startswith(b"\x89PNG")
     assert [path.name for path in found.report(tmp_path)] == ["report.json", "report.html"]

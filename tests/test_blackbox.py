@@ -11,7 +11,6 @@ import pytest
 import zenohkit
 from daemonkit import vsa_text
 from mcap.reader import make_reader
-from test_cli_run import free_port, process
 from test_recording_recorder import joint_file
 
 from drivelink import cli, jointfile
@@ -121,7 +120,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path, monkeypatch, 
     scene = Scene(tmp_path)
     scene.run(20)
     scene.box.keep("asked")
-    monkeypatch.setattr("drivelink.recording.sinks.os.pwrite", full)
+    monkeypatch.setattr("drivelink.recording.sinks.os.write", full)
     assert not scene.finish()
     assert [record.getMessage().count("No space left on device") for record in caplog.records] == [1]
     assert [path.name for path in (tmp_path / "kept").iterdir()] == ["elbow.day.csv"]
@@ -148,13 +147,13 @@ def test_keep_without_a_black_box_says_what_it_expects(tmp_path, capsys):
 
 
 def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path):
-    bus = f'interface = "socketcand"\noptions = {{ host = "127.0.0.1", port = {free_port()} }}\nperiod_s = 0.005'
+    bus = f'interface = "socketcand"\noptions = {{ host = "127.0.0.1", port = {zenohkit.free_port()} }}\nperiod_s = 0.005'
     path = tmp_path / "elbow.toml"
     text = vsa_text(channel="can0", endpoint=zenohkit.free_endpoint(), bus=bus)
     path.write_text(text + '[recording]\nfolder = "kept"\n')
-    with process("sim", str(path)) as drives:
+    with zenohkit.process("sim", str(path)) as drives:
         assert "ready" in drives.stdout.readline()
-        with process("run", str(path), "--no-realtime", "--json") as daemon:
+        with zenohkit.process("run", str(path), "--no-realtime", "--json") as daemon:
             assert "ready" in daemon.stdout.readline()
             zenohkit.until((tmp_path / "kept").is_dir)
             time.sleep(3.0)  # until the box has a state of the estimator

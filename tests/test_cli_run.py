@@ -1,51 +1,21 @@
 """`drivelink run` as a process: ready, published, ended; and every bad start in one line."""
 
 import json
-import os
 import re
 import signal
 import socket
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from daemonkit import served, vsa_text
-from zenohkit import free_endpoint, until
+from zenohkit import free_endpoint, free_port, process, until
 
 from drivelink.cli import main
 from drivelink.jointfile import load
 from drivelink.plaintext import stamped
 from drivelink.pubsub.client import subscribe
 from estimator.sample import Status
-
-REPOSITORY = Path(__file__).parent.parent
-
-
-@contextmanager
-def process(*arguments: str, **environment: str) -> Iterator[subprocess.Popen[str]]:
-    running = subprocess.Popen(
-        [sys.executable, "-m", "drivelink", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=REPOSITORY,
-        env=os.environ | environment,
-    )
-    try:
-        yield running
-    finally:
-        running.kill()
-        running.communicate()
-
-
-def free_port() -> int:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])
 
 
 @pytest.fixture

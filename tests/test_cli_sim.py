@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import can
 import pytest
+from zenohkit import free_port, process
 
 from drivelink.cli import main
 
@@ -40,8 +39,7 @@ case = "vsa-ii"
 
 @pytest.fixture
 def port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return int(free.getsockname()[1])
+    return free_port()
 
 
 @pytest.fixture
@@ -52,19 +50,14 @@ def file(tmp_path: Path, port: int) -> Path:
 
 
 @contextmanager
-def simulation(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def simulation(path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The process, and the line that it prints when it is ready."""
-    command = [sys.executable, "-m", "drivelink", "sim", *map(str, arguments)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            yield process, process.stdout.readline().strip()
-        finally:
-            process.kill()
+    with process("sim", path) as running:
+        yield running, running.stdout.readline().strip()
 
 
 def test_two_processes_share_the_bus_over_tcp_and_sigterm_ends_cleanly(file, port, capsys):
-    with simulation(file) as (process, ready):
+    with simulation(file) as (drives, ready):
         assert ready == ("drivelink sim: ready on socketcand vcan0: wrist (drive 1, drive 2); Ctrl-C ends it")
         with can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=port) as bus:
             bus.send(can.Message(arbitration_id=0, data=[1, 0], is_extended_id=False))
@@ -80,9 +73,8 @@ def test_two_processes_share_the_bus_over_tcp_and_sigterm_ends_cleanly(file, por
         said = capsys.readouterr().err.splitlines()
         assert "joined" in said[0]
         assert "node 1, node 2: on the bus already: another `drivelink sim`" in said[1]
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENCE_S) == 0
-        assert process.stderr is not None and process.stderr.read() == ""
+        drives.send_signal(signal.SIGTERM)
+        assert drives.wait(PATIENCE_S) == 0 and drives.stderr.read() == ""
 
 
 def test_it_ends_by_itself_and_leaves_the_data_sheets(file, tmp_path, capsys):
@@ -102,13 +94,12 @@ def test_other_simulations_join_the_first_as_clients(file, tmp_path):
 
     with (
         simulation(file) as (server, first),
-        simulation(others("elbow", 1)) as (process, second),
+        simulation(others("elbow", 1)) as (joined, second),
         simulation(others("knee", 2)) as (other, _),
     ):
         assert "wrist (drive 1, drive 2)" in first and "elbow (drive 11, drive 12)" in second
         other.send_signal(signal.SIGINT)
         assert other.wait(PATIENCE_S) == 0
         server.kill()
-        assert process.wait(PATIENCE_S) == 4
-        assert process.stderr is not None
-        assert "the process that served it has ended" in process.stderr.read()
+        assert joined.wait(PATIENCE_S) == 4
+        assert "the process that served it has ended" in joined.stderr.read()

@@ -45,9 +45,11 @@ def motion(n: int = 5000) -> np.ndarray:
     return np.column_stack((t, theta, 0.125 * push + 0.8 * speed - 150.0 * (q - theta), q))
 
 
-def ours(path: Path) -> Path:
-    header = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
-    np.savetxt(path, motion(), fmt="%.17g", delimiter=",", header=header, comments="")
+def ours(path: Path, n: int = 5000, nan_row: int | None = None) -> Path:
+    header, table = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad", motion(n)
+    if nan_row is not None:
+        table[nan_row, 1] = np.nan
+    np.savetxt(path, table, fmt="%.17g", delimiter=",", header=header, comments="")
     return path
 
 

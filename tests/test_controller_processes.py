@@ -13,8 +13,7 @@ import threading
 
 import controllerkit as kit
 import pytest
-from test_cli_run import free_port, process
-from zenohkit import free_endpoint, until
+from zenohkit import free_endpoint, free_port, process, until
 
 
 def reaches(events: list[dict], phase: str, after: int = 0) -> dict:

@@ -128,41 +128,35 @@ def _same(printed: list[tuple[str, str]], written: dict[str, float]) -> None:
             pytest.param(m, k, "skewed", marks=pytest.mark.slow)
             for m, k in (("linear", ""), ("polynomial", LINK))
         ),
+        ("", "", "pair"),
+        ("", "", "rigid"),
     ],
 )
 def test_what_is_printed_is_what_is_written(model, link, run, folder, capsys):
-    (folder / "joint.toml").write_text(ONE.format(model=model) + link)
-    written, document, tables = _fit(folder, run, "joint.toml", capsys)
-    (motor,) = written["motor"]
-    _same(tables[0], _of_motor(motor))
-    (entry,) = document["transmissions"]
-    assert entry["parameters"] == motor["transmission"].get("parameters", {})
-    std = np.sqrt(np.diag(motor["transmission"]["covariance"]))
-    assert np.allclose(std, np.concatenate([np.atleast_1d(x) for x in entry["std"].values()]), rtol=1e-6)
-    own = entry["motor"]
-    assert motor["viscous_damping_std_nm_s_rad"] == own["viscous_damping_std_nm_s_rad"]
-    share = own["inertia_std_kg_m2"] / own["inertia_kg_m2"]
-    assert motor["inertia_std_relative"] == pytest.approx(share)
-    assert {k: entry["motor"][k] for k in ("inertia_kg_m2", "viscous_damping_nm_s_rad")} == dict(
-        _numbers(motor)
-    )
-    assert entry.get("effects", []) == motor.get("effect", [])
+    name = "joint.toml" if model else f"{run}.toml"
+    if model:
+        (folder / name).write_text(ONE.format(model=model) + link)
+    written, document, tables = _fit(folder, run, name, capsys)
     owner = written.get("link", {})
     assert document.get("link", {}) == owner
+    *_, last = tables
     if owner:
-        _same(tables[1], dict(_numbers(owner.get("dynamics", {}))) | _of_effects(owner))
-    else:
-        assert len(tables) == 1
-
-
-@pytest.mark.parametrize("name", ["pair", "rigid"])
-def test_both_motors_of_a_pair_and_a_rigid_joint_are_written_as_printed(name, folder, capsys):
-    written, document, tables = _fit(folder, name, f"{name}.toml", capsys)
-    for table, motor, entry in zip(tables, written["motor"], document["transmissions"], strict=False):
+        _same(last, dict(_numbers(owner.get("dynamics", {}))) | _of_effects(owner))
+    motors = written["motor"]
+    assert len(tables) == len(motors) + bool(owner)
+    for table, motor, entry in zip(tables, motors, document["transmissions"], strict=False):
         _same(table, _of_motor(motor))
         assert entry["parameters"] == motor["transmission"].get("parameters", {})
-        own = {key: entry["motor"][key] for key in ("inertia_kg_m2", "viscous_damping_nm_s_rad")}
-        assert own == dict(_numbers(motor))
+        if entry["parameters"]:
+            std = np.sqrt(np.diag(motor["transmission"]["covariance"]))
+            stated = np.concatenate([np.atleast_1d(x) for x in entry["std"].values()])
+            assert np.allclose(std, stated, rtol=1e-6)
+        own = entry["motor"]
+        assert motor["viscous_damping_std_nm_s_rad"] == own["viscous_damping_std_nm_s_rad"]
+        share = own["inertia_std_kg_m2"] / own["inertia_kg_m2"]
+        assert motor["inertia_std_relative"] == pytest.approx(share)
+        known = {k: own[k] for k in ("inertia_kg_m2", "viscous_damping_nm_s_rad")}
+        assert known == dict(_numbers(motor))
         assert entry.get("effects", []) == motor.get("effect", [])
 
 

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import struct
-import subprocess
-import sys
 
 import aiohttp
 import pytest
-from zenohkit import free_endpoint, ready, script
+from zenohkit import free_endpoint, joint_text, process, ready, script
 
 pytest.importorskip("foxglove", reason="needs the extra foxglove")
-JOINT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.125\n[motor.transmission]\nmodel = "linear"\n[zenoh]\nendpoint = "{}"\n'
 
 
 async def listened(port):
@@ -39,16 +35,12 @@ async def listened(port):
 
 def test_estimates_come_live_over_a_websocket(tmp_path):
     endpoint, path = free_endpoint(), tmp_path / "elbow.toml"
-    path.write_text(JOINT.format(endpoint))
-    command = [sys.executable, "-m", "drivelink", "monitor", str(path), "--foxglove", "--port", "0"]
+    path.write_text(joint_text("elbow", endpoint))
     with script("elbow", endpoint) as daemon:
         ready(daemon)
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ) as bridge:
-            try:
-                port = int(bridge.stdout.readline().rpartition(":")[2].split()[0])
-                channel, data = asyncio.run(asyncio.wait_for(listened(port), 60))
-            finally:
-                bridge.kill()
+        with process("monitor", path, "--foxglove", "--port", "0") as bridge:
+            port = int(bridge.stdout.readline().rpartition(":")[2].split()[0])
+            channel, data = asyncio.run(asyncio.wait_for(listened(port), 60))
     assert json.loads(channel["schema"])["properties"]["stiffness_nm_rad"]["unit"] == "N·m/rad"
     assert struct.unpack_from("<I", data, 1) == (7,)
     estimate = json.loads(data[13:])

@@ -11,8 +11,7 @@ from pathlib import Path
 import can
 import pytest
 from daemonkit import running, served, vsa
-from test_cli_run import free_port
-from zenohkit import until
+from zenohkit import free_port, until
 
 from drivelink._core import JointPipeline
 from drivelink.canopen.bus import open_bus

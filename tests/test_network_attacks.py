@@ -326,7 +326,7 @@ def test_nothing_that_is_published_ends_the_monitor_the_recorder_or_a_client(end
             tap.poll()
 
     with drivelink.subscribe("elbow", session=session) as client:
-        until(lambda: (put_good(), poll(), client.received and all(tap.newest_s for tap in taps))[-1])
+        until(lambda: (put_good(), poll(), client.received and all(tap._sequence >= 0 for tap in taps))[-1])
         for name, payloads in attacks.items():
             for payload in payloads:
                 put(name, payload)

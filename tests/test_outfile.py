@@ -11,6 +11,7 @@ from pathlib import Path
 import joints
 import numpy as np
 import pytest
+import zenohkit
 
 from drivelink import cli
 from drivelink import files as written
@@ -129,11 +130,9 @@ def test_a_kill_at_any_moment_leaves_the_old_file_or_the_new_one(tmp_path):
     path, rng = tmp_path / "a.txt", np.random.default_rng(1)
     path.write_text("a" * 200_000)
     for _ in range(6):
-        process = subprocess.Popen([sys.executable, "-c", AGAIN, str(path)], stdout=subprocess.PIPE)
-        assert process.stdout.readline()
-        time.sleep(rng.uniform(0.0, 0.02))
-        process.kill()
-        process.communicate()
+        with zenohkit.python("-c", AGAIN, path) as process:
+            assert process.stdout.readline()
+            time.sleep(rng.uniform(0.0, 0.02))
         assert path.read_text() in ("a" * 200_000, "b" * 200_000)
 
 

@@ -55,19 +55,12 @@ def test_progress_says_what_is_being_done(clock):
         assert "diagnose run.csv (bandwidth)" in text(shown) and "(search)" in text(shown)
 
 
-def test_long_work_on_a_terminal_is_a_bar_that_goes_away(clock):
+def test_long_work_on_a_terminal_is_a_bar_that_goes_away_also_where_it_breaks_off(clock):
     shown = console(terminal=True)
-    with Meter("fit", 100, shown) as meter:
+    with pytest.raises(KeyboardInterrupt), Meter("fit", 100, shown) as meter:
         clock.now_s += 3.0
         meter.advance(40)
+        raise KeyboardInterrupt
     assert "fit" in text(shown) and "40/100" in text(shown)
     assert text(shown).rstrip().endswith("\x1b[2K")  # the line is erased
-
-
-def test_work_that_breaks_off_leaves_the_terminal_as_it_was(clock):
-    shown = console(terminal=True)
-    with pytest.raises(KeyboardInterrupt), Meter("fit", 1000, shown) as meter:
-        clock.now_s += 3.0
-        meter.advance()
-        raise KeyboardInterrupt
     assert "\x1b[?25h" in text(shown)  # the cursor is back

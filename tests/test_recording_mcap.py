@@ -4,16 +4,14 @@ import json
 import math
 import os
 import random
-import signal
 import struct
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import zenohkit
 from mcap.reader import NonSeekingReader, make_reader
 
 from drivelink.errors import RecordingError
@@ -31,6 +29,7 @@ from estimator.sample import SIGMA_95, Sample, Status, TransmissionEstimate
 
 TEXT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
 JOINT = parse(TEXT)
+HERE = Path(__file__).parent
 BEGIN_NS = 1_700_000_000_000_000_000
 
 
@@ -182,8 +181,7 @@ def test_what_is_no_mcap_file_is_one_clear_line(tmp_path):
 
 
 WRITER = """
-import sys, time
-sys.path.insert(0, {tests!r})
+import sys
 from pathlib import Path
 from test_recording_mcap import JOINT, TEXT, BEGIN_NS, sample, estimate
 from drivelink.errors import RecordingError
@@ -206,12 +204,7 @@ except RecordingError as error:
 
 
 def writer(path, before=""):
-    tests = str(Path(__file__).parent)
-    command = [sys.executable, "-c", before + WRITER.format(tests=tests), str(path)]
-    environment = os.environ | {"PYTHONPATH": str(Path(tests).parent)}
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    )
+    return zenohkit.python("-c", before + WRITER, path, PYTHONPATH=f"{HERE.parent}{os.pathsep}{HERE}")
 
 
 def count(path):
@@ -229,11 +222,8 @@ SUFFIXES = [".mcap", *(pytest.param(suffix, marks=pytest.mark.slow) for suffix i
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_killed_recording_is_there_up_to_the_last_flush(suffix, tmp_path):
     path = tmp_path / f"r{suffix}"
-    process = writer(path)
-    assert process.stdout is not None
-    flushed = [int(process.stdout.readline()) for _ in range(8)][-1]
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
+    with writer(path) as process:
+        flushed = [int(process.stdout.readline()) for _ in range(8)][-1]
     assert count(path) >= flushed
 
 
@@ -243,8 +233,8 @@ def test_a_full_disk_is_one_line_and_a_file_that_is_whole(suffix, tmp_path):
     # No more than 40 kB in a file: the write fails as on a full disk (EFBIG instead of ENOSPC).
     limit = "import resource, signal\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
     limit += "resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))\n"
-    process = writer(path, limit)
-    out, err = process.communicate(timeout=60)
+    with writer(path, limit) as process:
+        out, err = process.communicate(timeout=60)
     assert process.returncode == 3, err
     whole, _, line = out.splitlines()[-1].partition(" ")
     assert "cannot be written any further" in line

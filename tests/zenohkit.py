@@ -1,12 +1,12 @@
 """What the zenoh tests share: free ports, joints, and daemons in processes of their own that can be killed."""
 
 import os
-import signal
 import socket
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,17 +18,25 @@ HERE = Path(__file__).parent
 LIMIT_S = 60.0  # patience with a loaded machine; nothing is asserted about time itself
 
 
-def free_endpoint() -> str:
+def free_port() -> int:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+        return int(listener.getsockname()[1])
 
 
-def make_joint(name: str, endpoint: str, more: str = "") -> JointFile:
-    return parse(
+def free_endpoint() -> str:
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+def joint_text(name: str, endpoint: str, more: str = "") -> str:
+    return (
         f'name = "{name}"\n[[motor]]\ninertia_kg_m2 = 0.125\n[motor.transmission]\nmodel = "linear"\n'
         f'parameters = {{ k_nm_rad = 700.0 }}\n[zenoh]\nendpoint = "{endpoint}"\n{more}'
     )
+
+
+def make_joint(name: str, endpoint: str, more: str = "") -> JointFile:
+    return parse(joint_text(name, endpoint, more))
 
 
 def make_estimate(sequence: int, status: int = Status.VALID | Status.OBSERVABLE, motors: int = 1) -> Estimate:
@@ -91,21 +99,28 @@ def until(condition, limit_s: float = LIMIT_S):
 
 
 @contextmanager
-def script(*args: str, name: str = "zenoh_daemon.py"):
-    """A Python process of the test; killed at the end, stopped or not."""
-    environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
-    process = subprocess.Popen(
-        [sys.executable, str(HERE / name), *args],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def process(*arguments: str | Path, **environment: str) -> Iterator[subprocess.Popen[str]]:
+    """A verb of the command line in a process; killed at the end, stopped or not."""
+    with python("-m", "drivelink", *arguments, **environment) as running:
+        yield running
+
+
+@contextmanager
+def python(*arguments: str | Path, **environment: str) -> Iterator[subprocess.Popen[str]]:
+    environment = os.environ | {"PYTHONPATH": str(HERE.parent), "PYTHONUNBUFFERED": "1"} | environment
+    command = [sys.executable, *map(str, arguments)]
+    pipe = subprocess.PIPE
+    running = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment)
     try:
-        yield process
+        yield running
     finally:
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
+        running.kill()
+        running.communicate()
+
+
+def script(*arguments: str, name: str = "zenoh_daemon.py") -> AbstractContextManager[subprocess.Popen[str]]:
+    """A Python process of the test."""
+    return python(HERE / name, *arguments)
 
 
 def connected(publisher, joint) -> None:

@@ -12,9 +12,12 @@ import importlib
 import logging
 import math
 import os
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol
 
 from drivelink.errors import DrivelinkError, UsageError
@@ -24,19 +27,6 @@ from estimator.errors import EstimatorError
 
 if TYPE_CHECKING:
     from drivelink.jointfile import JointFile
-
-__all__ = [
-    "ALONE",
-    "VERBS",
-    "add_bus",
-    "add_map",
-    "add_recordings",
-    "main",
-    "make_parser",
-    "moved",
-    "require_distinct",
-    "warn",
-]
 
 VERBS = {
     "demo": "everything without hardware: simulated drives, daemon, subscriber, live view",
@@ -262,6 +252,20 @@ def add_bus(parser: argparse.ArgumentParser) -> None:
 def moved(joint: JointFile, args: argparse.Namespace) -> JointFile:
     """Return the joint on the interface and channel of the command line."""
     return joint.model_copy(update={"bus": joint.bus.moved(args.interface, args.channel)})
+
+
+@contextmanager
+def handling(
+    handler: Callable[[int, FrameType | None], object],
+    numbers: Iterable[int] = (signal.SIGINT, signal.SIGTERM),
+) -> Iterator[None]:
+    """Have signals handled while a block runs, and as before after it."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
 
 
 def _fail(verb: str, error: object, status: int) -> int:

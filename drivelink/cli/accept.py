@@ -77,12 +77,9 @@ def _asked() -> bool:
 
 def _watch(path: Path, *, quiet: bool) -> Trial:
     """Follow the daemon until the residual has fallen, or a minute is over."""
-    joint = jointfile.load(path)
-    config = path.absolute().parent / joint.zenoh.config if joint.zenoh.config else None
-    trial, next_s = Trial(path, time.monotonic()), 0.0
-    with subscribe(
-        joint.name, endpoint=joint.zenoh.endpoint, config=config, prefix=joint.zenoh.prefix
-    ) as live:
+    source, trial, next_s = jointfile.load_text(path), Trial(path, time.monotonic()), 0.0
+    name, zenoh = source.joint.name, source.joint.zenoh
+    with subscribe(name, endpoint=zenoh.endpoint, config=source.zenoh_config, prefix=zenoh.prefix) as live:
         while trial.fallen is None:
             now_s = time.monotonic()
             trial.take(live.status or {}, live.model or {}, now_s)

@@ -6,6 +6,7 @@ import argparse
 import importlib.util
 import json
 import sys
+from dataclasses import fields
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -120,15 +121,8 @@ def _settings(args: argparse.Namespace) -> Settings:
     since = None if args.since is None else _since(args.since)
     if not args.joints.exists():
         raise UsageError(f"--joints: expected a folder of joint files, there is no {args.joints}")
-    settings = Settings(
-        scheduler=args.scheduler,
-        insecure=args.insecure,
-        workers=args.workers,
-        memory=args.memory,
-        since=since,
-        validate=args.validate,
-        again=args.again,
-    )
+    given = {one.name: getattr(args, one.name) for one in fields(Settings)}
+    settings = Settings(**{**given, "since": since})
     _ = settings.limit_bytes  # raises
     return settings
 

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from rich.console import Console, Group, RenderableType
@@ -93,23 +93,19 @@ def run(args: argparse.Namespace) -> int:
     if args.foxglove:
         return _foxglove(args)
     name, endpoint, config, prefix = _where(args)
-    session = open_client(endpoint, config)
-    try:
+    end = time.monotonic() + args.seconds if args.seconds else float("inf")
+    with ExitStack() as stack:
+        session = open_client(endpoint, config)
+        stack.callback(close_session, session)
         watcher = Watcher(session, prefix, name)
-        end = time.monotonic() + args.seconds if args.seconds else float("inf")
-        try:
-            if args.web:
-                _serve(watcher, args, end, acceptance)
-            elif sys.stdout.isatty() and not args.json:
-                _show(watcher, end, f"{prefix}/{name or '*'} at {config or endpoint}")
-            else:
-                _print(watcher, end, args.every, as_json=args.json)
-        except KeyboardInterrupt:
-            pass
-        finally:
-            watcher.close()
-    finally:
-        close_session(session)
+        stack.callback(watcher.close)
+        stack.enter_context(suppress(KeyboardInterrupt))
+        if args.web:
+            _serve(watcher, args, end, acceptance)
+        elif sys.stdout.isatty() and not args.json:
+            _show(watcher, end, f"{prefix}/{name or '*'} at {config or endpoint}")
+        else:
+            _print(watcher, end, args.every, as_json=args.json)
     return 0
 
 
@@ -123,18 +119,17 @@ def _foxglove(args: argparse.Namespace) -> int:
     joint = jointfile.load(Path(args.joint))
     _, endpoint, config, _ = _where(args)
     end = time.monotonic() + args.seconds if args.seconds else float("inf")
-    session = open_client(endpoint, config)
-    try:
+    with ExitStack() as stack:
+        session = open_client(endpoint, config)
+        stack.callback(close_session, session)
         sink = FoxgloveSink(joint, args.port)
-        with Recorder(sink, []) as recorder:
-            tap = ZenohTap(session, joint, sink, FirstSource(sink))
-            recorder.taps.append(tap)
-            print(f"open a connection to ws://127.0.0.1:{sink.port}   (Ctrl-C ends)", flush=True)
-            with suppress(KeyboardInterrupt):
-                recorder.run(lambda: time.monotonic() >= end)
-            tap.close()
-    finally:
-        close_session(session)
+        recorder = stack.enter_context(Recorder(sink, []))
+        tap = ZenohTap(session, joint, sink, FirstSource(sink))
+        stack.callback(tap.close)
+        recorder.taps.append(tap)
+        print(f"open a connection to ws://127.0.0.1:{sink.port}   (Ctrl-C ends)", flush=True)
+        with suppress(KeyboardInterrupt):
+            recorder.run(lambda: time.monotonic() >= end)
     return 0
 
 
@@ -142,10 +137,9 @@ def _where(args: argparse.Namespace) -> tuple[str | None, str, Path | None, str]
     """Joint, endpoint, configuration and prefix, from options and joint file."""
     name, endpoint, config, prefix = args.joint, ENDPOINT, None, "drivelink"
     if name is not None and _is_file(name):
-        path = Path(name)
-        joint = jointfile.load(path)
-        name, endpoint, prefix = joint.name, joint.zenoh.endpoint, joint.zenoh.prefix
-        config = path.absolute().parent / joint.zenoh.config if joint.zenoh.config else None
+        source = jointfile.load_text(name)
+        name, endpoint, prefix = source.joint.name, source.joint.zenoh.endpoint, source.joint.zenoh.prefix
+        config = source.zenoh_config
     return name, args.endpoint or endpoint, args.config or config, args.prefix or prefix
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import shutil
 import sys
 import sysconfig
@@ -143,19 +142,10 @@ def _case_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
 
 
 def _new_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
-    given = {
-        "name": args.name,
-        "arrangement": args.arrangement,
+    given = {key: getattr(args, option) for key, option, _ in _QUESTIONS} | {
         "inertia_kg_m2": args.inertia,
-        "rotor_inertia_gcm2": args.rotor_inertia,
-        "torque_constant_mnm_a": args.torque_constant,
-        "viscous_damping_nm_s_rad": args.damping,
-        "model": args.model,
         "nodes": args.node,
-        "gear_ratio": args.gear,
         "encoder": _encoder(args.encoder),
-        "interface": args.interface,
-        "channel": args.channel,
         "bitrate": args.bitrate,
         "passive": args.passive or None,
     }
@@ -204,73 +194,56 @@ def _scanned(answers: Answers) -> Answers:
     return answers_from_bus(answers, found)
 
 
-def _one_of(*choices: str) -> Callable[[str], str]:
-    def check(reply: str) -> str:
-        if reply not in choices:
-            raise UsageError(f"expected {', '.join(choices)}, got {reply}")
-        return reply
-
-    return check
-
-
-def _number(reply: str) -> float:
-    try:
-        value = float(reply)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise UsageError(f"expected a number, got {reply}")
-    return value
-
-
-def _positive(reply: str) -> float:
-    value = _number(reply)
-    if value <= 0.0:
-        raise UsageError(f"expected a number above 0, got {reply}")
-    return value
-
-
-def _node_id(reply: str) -> int:
-    if reply.isdecimal() and 1 <= int(reply) <= 127:
-        return int(reply)
-    raise UsageError(f"expected a node id from 1 to 127, got {reply}")
-
-
-_QUESTIONS: tuple[tuple[str, str, Callable[[str], Any]], ...] = (
-    ("name", "Name of the joint", str),
-    ("arrangement", f"Arrangement of the motors: {', '.join(_ARRANGEMENTS)}", _one_of(*_ARRANGEMENTS)),
-    ("gear_ratio", "Gear ratio: motor revolutions per joint revolution, 1 for a direct drive", _positive),
-    ("rotor_inertia_gcm2", "Rotor inertia of the motor, g·cm² (its data sheet)", _positive),
+# Keys of `Answers`, with the option that answers and the question.
+_QUESTIONS = (
+    ("name", "name", "Name of the joint"),
+    ("arrangement", "arrangement", f"Arrangement of the motors: {', '.join(_ARRANGEMENTS)}"),
+    ("gear_ratio", "gear", "Gear ratio: motor revolutions per joint revolution, 1 for a direct drive"),
+    ("rotor_inertia_gcm2", "rotor_inertia", "Rotor inertia of the motor, g·cm² (its data sheet)"),
     (
         "torque_constant_mnm_a",
+        "torque_constant",
         "Torque constant of the motor, mN·m/A (its data sheet; Enter: the drive reports its torque)",
-        _positive,
     ),
-    ("viscous_damping_nm_s_rad", "Motor damping at the joint side, N·m·s/rad (0: not known)", _number),
-    ("model", f"Transmission: {', '.join(_MODELS)}", _one_of(*_MODELS)),
-    ("interface", "CAN interface (python-can)", str),
-    ("channel", "Channel", str),
+    ("viscous_damping_nm_s_rad", "damping", "Motor damping at the joint side, N·m·s/rad (0: not known)"),
+    ("model", "model", f"Transmission: {', '.join(_MODELS)}"),
+    ("interface", "interface", "CAN interface (python-can)"),
+    ("channel", "channel", "Channel"),
 )
 
 
 def _ask(answers: Answers, known: set[str]) -> None:
     """Ask for each missing answer; Enter keeps the default."""
     try:
-        for key, question, check in _QUESTIONS:
+        for key, option, question in _QUESTIONS:
             if key in known or (key == "rotor_inertia_gcm2" and "inertia_kg_m2" in known):
                 continue
             needed = key in ("gear_ratio", "rotor_inertia_gcm2")  # no drive reports them
-            setattr(answers, key, _asked(question, getattr(answers, key), check, needed=needed))
+            setattr(answers, key, _asked(question, getattr(answers, key), _check(option), needed=needed))
             if key == "rotor_inertia_gcm2":
                 print(f"  at the joint: {answers.conversion}")
         if "nodes" not in known:
             for motor in range(1, answers.motors + 1):
-                answers.nodes.append(_asked(f"Node id of the drive of motor {motor}", motor, _node_id))
+                answers.nodes.append(_asked(f"Node id of the drive of motor {motor}", motor, _check("node")))
         if "encoder" not in known:
             question = "Link encoder: drive, none, or node id of a CiA 406 encoder"
             answers.encoder = _asked(question, answers.encoder, _encoder) or answers.encoder
     except EOFError:
         raise UsageError("the questions were not answered; options answer them, too: --help") from None
+
+
+def _check(option: str) -> Callable[[str], Any]:
+    """What makes a value of the text that an option may be given."""
+    parser = argparse.ArgumentParser()
+    configure(parser)
+    action = next(one for one in parser._actions if one.dest == option)
+
+    def check(reply: str) -> Any:
+        if action.choices is not None and reply not in action.choices:
+            raise UsageError(f"expected {', '.join(action.choices)}, got {reply}")
+        return action.type(reply) if callable(action.type) else reply
+
+    return check
 
 
 def _asked(question: str, default: Any, check: Callable[[str], Any], *, needed: bool = False) -> Any:

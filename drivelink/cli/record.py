@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
 import threading
 import time
@@ -20,7 +19,7 @@ from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cli import add_bus, add_seconds, moved
+from drivelink.cli import add_bus, add_seconds, handling, moved
 from drivelink.errors import BusError, DrivelinkError, RecordingError, UsageError, ZenohError
 from drivelink.files import check_target
 from drivelink.jointfile import JointFile, JointText
@@ -86,9 +85,8 @@ def run(args: argparse.Namespace) -> int:
     if args.layouts is not None:
         write_layouts(joint, args.layouts)
     stopped = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopped.set())
     with ExitStack() as stack:
+        stack.enter_context(handling(lambda *_: stopped.set()))
         sink = open_sink(args.out, joint, source.text, force=args.force)
         recorder = stack.enter_context(Recorder(sink, []))
         add_taps(recorder, args.source, source, stack)
@@ -117,11 +115,7 @@ def add_taps(recorder: Recorder, source: str, text: JointText, stack: ExitStack)
     sink, joint, folder = recorder.sink, text.joint, text.folder
     gate = FirstSource(sink)
     needed = source == "daemon" or (source == "auto" and sink.wants != {"frame"})
-    session = _session(joint, folder, needed)
-    if session is not None:
-        stack.callback(close_session, session)
-    alive = session is not None and _alive(session, joint)
-    known = _daemon_layouts(session, joint) if session is not None and alive else ()
+    session, alive, known = _daemon(text, stack, needed=needed)
     layouts = known or _declared_layouts(joint, folder)
     document = mapping_document(joint.name, layouts, text.text, daemon=bool(known))
     sink.mapping(document, time.time_ns())
@@ -172,30 +166,30 @@ def _alive(session: zenoh.Session, joint: JointFile) -> bool:
     return False
 
 
-def _session(joint: JointFile, folder: Path, needed: bool) -> zenoh.Session | None:
-    """Open a subscriber's session; None if that fails and it is not required.
+def _daemon(
+    source: JointText, stack: ExitStack, *, needed: bool
+) -> tuple[zenoh.Session | None, bool, Sequence[NodeLayout]]:
+    """A session that ends with the stack, whether a daemon serves the joint, and its mapping of the nodes.
 
     Raises:
-        ZenohError: it is needed.
+        ZenohError: there is no session, and it is needed.
     """
     try:
-        return open_client(joint.zenoh.endpoint, folder / joint.zenoh.config if joint.zenoh.config else None)
+        session = open_client(source.joint.zenoh.endpoint, source.zenoh_config)
     except ZenohError as error:
         if needed:
             raise
         _say(f"without the mapping that a daemon knows: {error}")
-        return None
+        return None, False, ()
+    stack.callback(close_session, session)
+    alive = _alive(session, source.joint)
+    return session, alive, _daemon_layouts(session, source.joint) if alive else ()
 
 
 def known_layouts(source: JointText) -> Sequence[NodeLayout]:
     """Return the mapping of the joint's nodes by a running daemon, else by the joint file; () if unknown."""
-    session = _session(source.joint, source.folder, needed=False)
-    try:
-        alive = session is not None and _alive(session, source.joint)
-        known = _daemon_layouts(session, source.joint) if session is not None and alive else ()
-    finally:
-        if session is not None:
-            close_session(session)
+    with ExitStack() as stack:
+        *_, known = _daemon(source, stack, needed=False)
     return known or _declared_layouts(source.joint, source.folder)
 
 

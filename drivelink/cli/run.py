@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from drivelink.cli import ALONE, add_bus, add_seconds, moved
+from drivelink.cli import ALONE, add_bus, add_seconds, handling, moved
 from drivelink.jointfile import BusSection, load
 from drivelink.plaintext import PlainFormatter, stamped
 
@@ -148,11 +148,6 @@ def _stopped_by_signals() -> Iterator[list[Daemon]]:
         for daemon in running:
             daemon.reload()
 
-    handlers = {signal.SIGINT: stop, signal.SIGTERM: stop}
-    handlers[signal.SIGHUP] = reload if os.environ.get("NOTIFY_SOCKET") else stop
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    try:
+    hang_up = reload if os.environ.get("NOTIFY_SOCKET") else stop
+    with handling(stop), handling(hang_up, (signal.SIGHUP,)):
         yield running
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -5,15 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import sys
 import threading
-import types
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from drivelink.cli import ALONE, add_bus, add_number, add_seconds
+from drivelink.cli import ALONE, add_bus, add_number, add_seconds, handling
 from drivelink.cycle.realtime import PRIORITY, acquire, release
 from drivelink.demo.simbus import JoinedBus, open_sim_bus, require_free
 from drivelink.demo.simulate import assumptions, bench_from_joints
@@ -81,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     if section.interface == "virtual":
         print(ALONE, file=sys.stderr)
     stop = threading.Event()
-    with _until_signal(stop), open_sim_bus(section) as bus, _ending(stop, args.seconds):
+    with handling(lambda *_: stop.set()), open_sim_bus(section) as bus, _ending(stop, args.seconds):
         if isinstance(bus, JoinedBus):
             print(f"drivelink sim: {bus.channel_info}: served by another process, joined", file=sys.stderr)
             bus.on_lost = stop.set
@@ -116,21 +114,6 @@ def _bus_section(joints: list[JointFile], args: argparse.Namespace) -> BusSectio
                     f"got {getattr(first, key)!r} and {getattr(joint.bus, key)!r}"
                 )
     return first.moved(args.interface, args.channel)
-
-
-@contextmanager
-def _until_signal(stop: threading.Event) -> Iterator[None]:
-    """SIGINT and SIGTERM set `stop`; restore the previous handlers afterwards."""
-
-    def handle(_number: int, _frame: types.FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

@@ -2,9 +2,9 @@
 
     python benchmarks/estimator_tick.py [--ticks N]
 
-Two-motor VSA joints at 1 kHz on encoder counts. A tick is timed alone, with nothing compiled at run time;
-the percentiles are over all ticks after the first three seconds. The diagnosis is of the paper's quadratic
-joint as `drivelink sim` makes it, with friction that the model lacks: CPU time of one thread.
+The demo's two-motor VSA at 1 kHz. A tick is timed alone, with nothing compiled at run time; the percentiles
+are over all ticks after the first three seconds. Fits (the best of three) and diagnoses are of the paper's
+quadratic joint, the latter with friction that the model lacks: CPU time of one thread.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import scene
 from diagnosis_seeds import measured
 
 from drivelink import jointfile
-from estimator import EstimatorSettings, JointModel, Motor, Record, Sample, Transmission, fit, make_estimator
+from drivelink.jointfile import JointFile
+from estimator import EstimatorSettings, JointModel, Sample, Transmission, fit, make_estimator
 from estimator.diagnosis import diagnose
 from estimator.model_monitor import ModelMonitor, measure_baseline
 
-T = 1e-3
 _CASES = {
     "robust, polynomial": ("polynomial", EstimatorSettings()),
     "robust, vsa-ii": ("vsa-ii", EstimatorSettings()),
@@ -32,41 +32,15 @@ _CASES = {
 }
 
 
-def joint(name: str, motors: int) -> JointModel:
-    motor = Motor(
-        inertia_kg_m2=0.02,
-        viscous_damping_nm_s_rad=0.02,
-        transmission=Transmission(model=name, order=2 if name == "polynomial" else None),
-    )
-    return JointModel(arrangement="antagonistic" if motors == 2 else "single", motors=(motor,) * motors)
+def packaged(name: str) -> JointFile:
+    """A joint file of the demo, without link dynamics."""
+    joint = jointfile.load(scene.ROOT / "drivelink" / "joints" / f"{name}.toml")
+    return joint.model_copy(update={"link": joint.link.model_copy(update={"dynamics": None})})
 
 
-def record(n: int, motors: int) -> Record:
-    """A motion that obeys eq 5 by construction: theta and phi are given, the torque follows."""
-    t = np.arange(n) * T
-    theta, torque = np.empty((n, motors)), np.empty((n, motors))
-    q = 0.3 * np.sin(1.1 * t)
-    for i in range(motors):
-        w1, w2 = 4.0 + i, 9.0 - i
-        phi = 0.3 * np.sin(w1 * t) + 0.15 * np.sin(w2 * t)
-        beta = np.arcsin(1.75 * np.sin(phi / 2)) - phi / 2
-        spring = 0.5 * beta * (1.75 * np.cos(phi / 2) / np.sqrt(1 - (1.75 * np.sin(phi / 2)) ** 2) - 1)
-        theta[:, i] = q - phi
-        omega = np.gradient(theta[:, i], T)
-        torque[:, i] = 0.02 * np.gradient(omega, T) + 0.02 * omega - spring
-    step = 2 * np.pi / 65536
-    return Record(
-        period_s=T,
-        sequence=np.arange(n),
-        motor_position_rad=np.floor(theta / step) * step,
-        motor_torque_nm=torque,
-        link_position_rad=np.floor(q / step) * step,
-    )
-
-
-def ticks(name: str, settings: EstimatorSettings, n: int) -> dict[str, float]:
-    """Percentiles of one tick in microseconds."""
-    return percentiles(make_estimator(joint(name, 2), settings, T).step, list(record(n, 2).samples()))
+def model_of(joint: JointFile, transmission: Transmission) -> JointModel:
+    model = joint.model()
+    return replace(model, motors=tuple(replace(m, transmission=transmission) for m in model.motors))
 
 
 def percentiles(step: Callable[[Sample], object], samples: list[Sample]) -> dict[str, float]:
@@ -84,48 +58,32 @@ def percentiles(step: Callable[[Sample], object], samples: list[Sample]) -> dict
     return {f"p{p:g}".replace(".", ""): float(np.percentile(late, p)) for p in (50, 90, 99, 99.9)}
 
 
-def monitored(n: int) -> dict[str, float]:
-    """Percentiles of one tick of the model's monitor in microseconds."""
-    motor = replace(
-        joint("vsa-ii", 1).motors[0],
-        transmission=Transmission(model="vsa-ii", parameters={"k_nm_rad": 0.5, "c": 1.75}),
-    )
-    model = JointModel(arrangement="antagonistic", motors=(motor, motor))
-    data = record(n, 2)
-    monitor = ModelMonitor(model, T, measure_baseline(data, model))
-    return percentiles(monitor.core.step, list(data.samples()))
-
-
-def batch(name: str) -> float:
-    """Seconds to fit 1e5 samples of one transmission; the best of three."""
-    data = record(100_000, 1)
-    spent = []
-    for _ in range(3):
-        begin = time.perf_counter()
-        fit(data, joint(name, 1))
-        spent.append(time.perf_counter() - begin)
-    return min(spent)
-
-
-def diagnosis(seconds: float) -> float:
-    """CPU seconds to diagnose one motor at 1 kHz."""
-    declared = jointfile.load(scene.ROOT / "drivelink" / "joints" / "quadratic.toml")
-    data = measured(declared, seconds, ["coulomb_friction=0.0005"])
-    begin = time.thread_time()
-    diagnose(data, declared.model())
-    return time.thread_time() - begin
-
-
 def rows(args) -> Iterator[scene.Row]:
     """One row a case; ticks in µs, the rest in its unit."""
+    vsa, quadratic = packaged("vsa-ii"), packaged("quadratic")
+    data, period_s = measured(vsa, args.ticks * vsa.bus.period_s), vsa.bus.period_s
     for case, (name, settings) in _CASES.items():
-        yield {"case": f"one tick, {case} / µs", **ticks(name, settings, args.ticks)}
-    yield {"case": "one tick, monitor, vsa-ii / µs", **monitored(args.ticks)}
+        spring = Transmission(model=name, order=2 if name == "polynomial" else None)
+        step = make_estimator(model_of(vsa, spring), settings, period_s).step
+        yield {"case": f"one tick, {case} / µs", **percentiles(step, list(data.samples()))}
+    known = model_of(vsa, Transmission(model="vsa-ii", parameters={"k_nm_rad": 0.5, "c": 1.75}))
+    step = ModelMonitor(known, period_s, measure_baseline(data, known)).core.step
+    yield {"case": "one tick, monitor, vsa-ii / µs", **percentiles(step, list(data.samples()))}
     other = dict.fromkeys(("p90", "p99", "p999"))
-    for name in ("polynomial", "vsa-ii"):
-        yield {"case": f"fit of 1e5 samples, {name} / s", "p50": batch(name), **other}
+    data = measured(quadratic, 100.0)
+    for name in ("polynomial", "exponential"):
+        model, spent = model_of(quadratic, Transmission(model=name)), []
+        for _ in range(3):
+            begin = time.perf_counter()
+            fit(data, model)
+            spent.append(time.perf_counter() - begin)
+        yield {"case": f"fit of 1e5 samples, {name} / s", "p50": min(spent), **other}
     for seconds in (10.0, 30.0):
-        yield {"case": f"diagnose {seconds:g} s at 1 kHz / s of CPU", "p50": diagnosis(seconds), **other}
+        data = measured(quadratic, seconds, ["coulomb_friction=0.0005"])
+        begin = time.thread_time()
+        diagnose(data, quadratic.model())
+        spent_s = time.thread_time() - begin
+        yield {"case": f"diagnose {seconds:g} s at 1 kHz / s of CPU", "p50": spent_s, **other}
 
 
 if __name__ == "__main__":

@@ -53,76 +53,62 @@ NOMINAL = 0.9  # a data sheet's spring over the true one
 LARGE, TYPICAL = 0.2, 0.5  # of gravity
 BANDWIDTH = EstimatorSettings().external_bandwidth_rad_s
 
-MOTOR = """[[motor]]
-inertia_kg_m2 = {inertia}
-viscous_damping_nm_s_rad = {damping}
-transmission = {{ model = "{model}"{spring} }}
-drive = {{ node_id = 1{drive} }}
-effect = [{effects}]
-"""
-JOINT = """name = "external"
-arrangement = "{arrangement}"
-{motors}
+SEA = """name = "sea"
+[[motor]]
+inertia_kg_m2 = 0.125
+viscous_damping_nm_s_rad = 0.8
+transmission = { model = "polynomial", order = 2, parameters = { coefficients_nm_rad = [150.0, 1500.0] } }
+effect = [{ name = "coulomb_friction", parameters = { torque_nm = 0.75 } }]
+[motor.drive]
+node_id = 1
+counts_per_rev = 4096
+rated_current_a = 6.0
+gear_ratio = 50.0
+torque_constant_nm_a = 0.05
 [link]
-encoder = {{ source = "cia406", node_id = 3{link_counts} }}
-[link.dynamics]
-inertia_kg_m2 = {link[0]}
-viscous_damping_nm_s_rad = {link[1]}
-gravity_nm = {link[2]}
-[sim]
-{case}
-excitation = {{ kind = "rich"{moved} }}
+encoder = { source = "cia406", node_id = 3, counts_per_rev = 131072 }
+dynamics = { inertia_kg_m2 = 0.4, viscous_damping_nm_s_rad = 0.1, gravity_nm = 6.0 }
+[sim.excitation]
+kind = "rich"
+low_hz = 0.15
+high_hz = 4.0
+amplitude_nm = 8.0
+centring_nm_rad = 10.0
+centring_nm_s_rad = 1.0
 """
-VSA = JOINT.format(
-    arrangement="antagonistic",
-    motors=2 * MOTOR.format(inertia=5e-4, damping=5e-3, model="vsa-ii", spring="", drive="", effects=""),
-    link_counts="",
-    link=(0.003, 0.001, 0.2943),
-    case='case = "vsa-ii"',
-    moved="",
-)
-
-
-def single(
-    motor: tuple[float, float],
-    link: tuple[float, float, float],
-    spring: list[float],
-    gear: tuple[float, float],
-    bits: int,
-    moved: tuple[float, float, float],
-    effects: str,
-) -> str:
-    """A joint with one motor: (B, D), (M, Dq, g), coefficients, (ratio, N·m/A), motion and its centring."""
-    names = ("amplitude_nm", "centring_nm_rad", "centring_nm_s_rad")
-    drive = ", counts_per_rev = 4096, rated_current_a = 6.0"
-    drive += f", gear_ratio = {gear[0]}, torque_constant_nm_a = {gear[1]}"
-    law = f", order = 2, parameters = {{ coefficients_nm_rad = {spring} }}"
-    return JOINT.format(
-        arrangement="single",
-        motors=MOTOR.format(
-            inertia=motor[0], damping=motor[1], model="polynomial", spring=law, drive=drive, effects=effects
-        ),
-        link_counts=f", counts_per_rev = {2**bits}",
-        link=link,
-        case="",
-        moved=", low_hz = 0.15, high_hz = 4.0"
-        + "".join(f", {name} = {value}" for name, value in zip(names, moved, strict=True)),
-    )
-
-
-COULOMB = '{ name = "coulomb_friction", parameters = { torque_nm = 0.75 } }'
-LOSSES = """{ name = "stribeck_friction", parameters = { torque_nm = 5.0, stribeck_nm = 2.0 } },
-{ name = "load_dependent_friction", parameters = { coefficient = 0.06 } }"""
+HD = """name = "hd"
+[[motor]]
+inertia_kg_m2 = 1.5
+viscous_damping_nm_s_rad = 8.0
+transmission = { model = "polynomial", order = 2, parameters = { coefficients_nm_rad = [8000.0, 1.0e8] } }
+[[motor.effect]]
+name = "stribeck_friction"
+parameters = { torque_nm = 5.0, stribeck_nm = 2.0, stribeck_velocity_rad_s = 0.1 }
+[[motor.effect]]
+name = "load_dependent_friction"
+parameters = { coefficient = 0.06 }
+[motor.drive]
+node_id = 1
+counts_per_rev = 4096
+rated_current_a = 6.0
+gear_ratio = 100.0
+torque_constant_nm_a = 0.1
+[link]
+encoder = { source = "cia406", node_id = 3, counts_per_rev = 1048576 }
+dynamics = { inertia_kg_m2 = 2.0, viscous_damping_nm_s_rad = 1.0, gravity_nm = 30.0 }
+[sim.excitation]
+kind = "rich"
+low_hz = 0.15
+high_hz = 4.0
+amplitude_nm = 40.0
+centring_nm_rad = 40.0
+centring_nm_s_rad = 10.0
+"""
+VSA = (scene.ROOT / "drivelink" / "joints" / "vsa-ii.toml").read_text(encoding="utf-8")
 RIGS = {
     "vsa": ("VSA-II (the paper's), no friction", VSA),
-    "sea": (  # of the documentation: dry friction of 5 % of the rated torque
-        "SEA, 150 N·m/rad, gear 50",
-        single((0.125, 0.8), (0.4, 0.1, 6.0), [150.0, 1500.0], (50.0, 0.05), 17, (8.0, 10.0, 1.0), COULOMB),
-    ),
-    "hd": (
-        "harmonic drive, 8000 N·m/rad, gear 100",
-        single((1.5, 8.0), (2.0, 1.0, 30.0), [8000.0, 1.0e8], (100.0, 0.1), 20, (40.0, 40.0, 10.0), LOSSES),
-    ),
+    "sea": ("SEA, 150 N·m/rad, gear 50", SEA),  # dry friction of 5 % of the rated torque
+    "hd": ("harmonic drive, 8000 N·m/rad, gear 100", HD),
 }
 
 

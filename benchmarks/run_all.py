@@ -58,7 +58,9 @@ SECTIONS = {
     ),
     "healthy": Section("Second recordings of healthy joints", quick="--seeds 2"),
     "real_data": Section("Real data before and after"),
-    "external": Section("External torque and contact", quick="--minutes 2 --errors 2 --joints sea"),
+    "external": Section(
+        "External torque and contact", "--minutes 10 --errors 0,2,5", "--minutes 2 --errors 2 --joints sea"
+    ),
     "fault_matrix": Section(
         "Sensor faults: wrong samples called valid", quick="--joints constant --seconds 8"
     ),

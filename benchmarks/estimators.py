@@ -8,10 +8,10 @@ bits at the link, no velocity, torque noise of 0.1 to 0.5 % of rated. Judged fro
 estimate is valid and observable: its error against the slope of the spring, relative to that slope (in a
 gap, to 0.3 of its rms); the share of its 95 % intervals that hold the slope.
 
-The springs of the first table move on random multisines by the integrator of the tests (`tests/joints.py`).
-With --undeclared the joints are those of an independent simulator in C (`world.c`), with cubic springs whose
-order is declared, and an effect of 3 to 8 % of the torque's amplitude that no file names. Names are counted
-by joints: in the end, and those that are given up again; the time is the median to the first of either.
+The joints are those of an independent simulator in C (`world.c`). With --undeclared they have cubic springs
+whose order is declared, and an effect of 3 to 8 % of the torque's amplitude that no file names. Names are
+counted by joints: in the end, and those that are given up again; the time is the median to the first of
+either.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 import scene
-from scene import joints
 from world import T, simulate
 
 from estimator import (
@@ -41,79 +40,38 @@ from estimator.sample import SIGMA_95
 SETTLED_S = 5.0  # the estimate is judged from there on
 USABLE = int(Status.VALID | Status.OBSERVABLE)
 OFF = (0.8, 1.2)  # k, and the shape above its lower bound, of a declaration that is 20 % off
-# name: (spring, model, order, declared off by, stiff, periods that the link is late, Coulomb friction in N·m)
+
+
+class Case(NamedTuple):
+    """A spring of `world.c`, and as what it is declared."""
+
+    spring: str = "cubic"
+    model: str = "polynomial"
+    order: int | None = 2
+    off: tuple[float, float] | None = None  # declared parameters over the true ones; None: none are
+    stiff: bool = False
+    more: Mapping[str, float | str] = {}
+
+
 CASES = {
-    "linear": ("linear", "linear", None, None, False, 0, 0.0),
-    "cubic": ("cubic", "polynomial", 2, None, False, 0, 0.0),
-    "cubic, order left out": ("cubic", "polynomial", None, None, False, 0, 0.0),
-    "cubic, link 1 period late": ("cubic", "polynomial", 2, None, False, 1, 0.0),
-    "cubic, link 3 periods late": ("cubic", "polynomial", 2, None, False, 3, 0.0),
-    "cubic, undeclared friction": ("cubic", "polynomial", 2, None, False, 0, 0.3),
-    "cubic, stiff": ("cubic", "polynomial", 2, None, True, 0, 0.0),
-    "vsa-ii from nothing": ("vsa-ii", "vsa-ii", None, None, False, 0, 0.0),
-    "vsa-ii declared right": ("vsa-ii", "vsa-ii", None, (1.0, 1.0), False, 0, 0.0),
-    "vsa-ii declared 20 % off": ("vsa-ii", "vsa-ii", None, OFF, False, 0, 0.0),
-    "exponential from nothing": ("exponential", "exponential", None, None, False, 0, 0.0),
-    "exponential declared 20 % off": ("exponential", "exponential", None, OFF, False, 0, 0.0),
+    "linear": Case("linear", "linear", None),
+    "cubic": Case(),
+    "cubic, order left out": Case(order=None),
+    "cubic, link 1 period late": Case(more={"link_delay": T}),
+    "cubic, link 3 periods late": Case(more={"link_delay": 3 * T}),
+    "cubic, undeclared friction": Case(more={"friction": "coulomb", "coulomb": 0.3}),
+    "cubic, stiff": Case(stiff=True),
+    "vsa-ii from nothing": Case("vsa-ii", "vsa-ii", None),
+    "vsa-ii declared right": Case("vsa-ii", "vsa-ii", None, (1.0, 1.0)),
+    "vsa-ii declared 20 % off": Case("vsa-ii", "vsa-ii", None, OFF),
+    "exponential from nothing": Case("exponential", "exponential", None),
+    "exponential declared 20 % off": Case("exponential", "exponential", None, OFF),
 }
-
-
-def springs(kind, K, rng):
-    """(torque, stiffness, per joint what declares it and its lower bound)."""
-    if kind == "vsa-ii":
-        k, c = rng.uniform(300, 700, K.shape), rng.uniform(1.5, 1.9, K.shape)
-        return *joints.vsa_ii(k, c), [
-            (("k_nm_rad", a), ("c", b), 1.0) for a, b in zip(k[:, 0], c[:, 0], strict=True)
-        ]
-    if kind == "exponential":
-        b = rng.uniform(3, 12, K.shape)
-        return (
-            lambda phi: np.sign(phi) * K / b * np.expm1(b * np.abs(phi)),
-            lambda phi: K * np.exp(b * np.abs(phi)),
-            [(("k_nm_rad", x), ("b_per_rad", y), 0.0) for x, y in zip(K[:, 0], b[:, 0], strict=True)],
-        )
-    where = 4e-3 if K.max() > 1000 else 0.06  # rad: there the cubic part is a few to thirty percent
-    cubic = rng.uniform(0.03, 0.3, K.shape) / where**2 if kind == "cubic" else np.zeros(K.shape)
-    return *joints.polynomial(np.stack([K, K * cubic], axis=-1)), [None] * len(K)
-
-
-class Drawn(NamedTuple):
-    """One joint of an ensemble: as it is declared, what its drive read, and the truth."""
-
-    model: JointModel
-    record: Record
-    stiffness_nm_rad: np.ndarray
-
-
-def draw_joints(case: str, n_joints: int, seconds: float, seed: int) -> Iterator[Drawn]:
-    """The joints of a case."""
-    kind, model, order, off, stiff, late, friction = CASES[case]
-    rng, n = np.random.default_rng(seed), round(seconds / T)
-
-    def draw(soft, hard):
-        return rng.uniform(*(hard if stiff else soft), (n_joints, 1))
-
-    K, B, D = draw((80, 220), (5500, 12000)), draw((0.08, 0.2), (0.3, 1.2)), draw((0.4, 1.2), (2, 10))
-    torque, stiffness, declared = springs(kind, K, rng)
-    M, Dq, gravity = draw((0.3, 0.6), (0.5, 1.5)), draw((0.1, 1), (0.1, 1)), draw((0, 6), (0, 15))
-    plants = joints.Plants(torque, stiffness, B, D, M[:, 0], Dq[:, 0], gravity[:, 0], coulomb=friction)
-    size = draw((5, 10), (15, 40))[None]
-    truth = joints.simulate(plants, joints.sweep(rng, n, n_joints, 1, T, size, 4.0 if stiff else 3.0), T)
-    for j in range(n_joints):
-        rated = 1.2 * np.abs(truth.tau[:, j]).max()
-        counts = rng.choice([4096, 8192, 16384]) * (100 if stiff else 1)
-        bits = rng.choice([17, 18] if stiff else [16, 17, 18])
-        noise = rng.uniform(0.001, 0.005) * rated
-        record = joints.record(
-            truth, j, T, motor_counts=counts, link_bits=bits, velocity_rad_s=None,
-            torque_noise=rng.normal(0, noise, (n, 1)), link_delay=late,
-        )  # fmt: skip
-        parameters = {}
-        if off is not None:
-            (k_name, k), (shape_name, shape), low = declared[j]
-            parameters = {k_name: off[0] * k, shape_name: low + off[1] * (shape - low)}
-        known = joints.joint_model(B[j, 0], D[j, 0], model=model, order=order, parameters=parameters)
-        yield Drawn(known, record, truth.sigma[:, j, 0])
+# Of a spring's shape: the setting, the parameter, its lower bound, the range that is drawn.
+SHAPES = {
+    "vsa-ii": ("linkage", "c", 1.0, (1.5, 1.9)),
+    "exponential": ("exponent", "b_per_rad", 0.0, (3.0, 12.0)),
+}
 
 
 def effects(rng: np.random.Generator, rated: float, stiffness: float) -> dict[str, dict[str, float | str]]:
@@ -149,49 +107,70 @@ def effects(rng: np.random.Generator, rated: float, stiffness: float) -> dict[st
 EFFECTS = tuple(effects(np.random.default_rng(0), 1.0, 1.0))
 
 
-def draw_undeclared(effect: str, count: int, seconds: float, motion: str) -> Iterator[Drawn]:
-    """Random joints, the same for every effect, with this one."""
-    for seed in range(1, count + 1):
-        rng = np.random.default_rng(seed)
-        stiffness, size = rng.uniform(80, 220), rng.uniform(5, 10)
-        inertia, damping = rng.uniform(0.08, 0.2), rng.uniform(0.4, 1.2)
-        settings = {
-            "spring": "cubic",
-            "stiffness": stiffness,
-            "cubic": stiffness * rng.uniform(0.03, 0.3) / 0.06**2,
-            "inertia": inertia,
-            "damping": damping,
-            "link_inertia": rng.uniform(0.3, 0.6),
-            "link_damping": rng.uniform(0.1, 1),
-            "gravity": rng.uniform(0, 6),
-            "motor_counts": int(rng.choice([4096, 8192, 16384])),
-            "link_bits": int(rng.choice([16, 17, 18])),
-            "torque_noise": rng.uniform(0.001, 0.005) * 2 * size,
-            "motion": motion,
-            "size": rng.uniform(0.5, 1.2) if motion == "point-to-point" else size,
-            "top_hz": rng.uniform(0.5, 2.0) if motion == "harmonic" else 3.0,
-            "push": size / 2 if motion == "pushes" else size,
-            "seconds": seconds,
-            "seed": seed,
-        }
-        motor = Motor(
-            inertia_kg_m2=inertia * (1.05 if effect == "inertia 5 % off" else 1.0),
-            viscous_damping_nm_s_rad=damping * (0.8 if effect == "damping 20 % off" else 1.0),
-            transmission=Transmission(model="polynomial", order=2, parameters={}),
-        )
-        world = simulate(**(settings | effects(rng, size, stiffness)[effect]))
-        model = JointModel(arrangement="single", motors=(motor,))
-        yield Drawn(model, world.record, world.stiffness_nm_rad)
+class Drawn(NamedTuple):
+    """One joint of an ensemble: as it is declared, what its drive read, and the truth."""
+
+    model: JointModel
+    record: Record
+    stiffness_nm_rad: np.ndarray
 
 
-def online(drawn: Drawn, mode: str) -> scene.Row:
+def drawn(case: Case, effect: str, seed: int, seconds: float, motion: str) -> Drawn:
+    """A random joint, the same for every effect, with this one."""
+    rng = np.random.default_rng(seed)
+
+    def between(soft: tuple[float, float], stiff: tuple[float, float]) -> float:
+        return rng.uniform(*(stiff if case.stiff else soft))
+
+    stiffness, size = between((80, 220), (5500, 12000)), between((5, 10), (15, 40))
+    inertia, damping = between((0.08, 0.2), (0.3, 1.2)), between((0.4, 1.2), (2, 10))
+    where = 4e-3 if case.stiff else 0.06  # rad: there the cubic part is a few to thirty percent
+    settings: dict[str, float | str] = {
+        "spring": case.spring,
+        "stiffness": stiffness,
+        "cubic": stiffness * rng.uniform(0.03, 0.3) / where**2,
+        "inertia": inertia,
+        "damping": damping,
+        "link_inertia": between((0.3, 0.6), (0.5, 1.5)),
+        "link_damping": rng.uniform(0.1, 1),
+        "gravity": between((0, 6), (0, 15)),
+        "motor_counts": int(rng.choice([4096, 8192, 16384])) * (100 if case.stiff else 1),
+        "link_bits": int(rng.choice([17, 18] if case.stiff else [16, 17, 18])),
+        "torque_noise": rng.uniform(0.001, 0.005) * 2 * size,
+        "motion": motion,
+        "size": rng.uniform(0.5, 1.2) if motion == "point-to-point" else size,
+        "top_hz": rng.uniform(0.5, 2.0) if motion == "harmonic" else 3.0,
+        "push": size / 2 if motion == "pushes" else size,
+        "seconds": seconds,
+        "seed": seed,
+    }
+    settings |= {**case.more, **effects(rng, size, stiffness)[effect]}
+    parameters = {}
+    if case.spring in SHAPES:
+        setting, name, low, span = SHAPES[case.spring]
+        shape = rng.uniform(*span)
+        k = rng.uniform(300.0, 700.0) if case.spring == "vsa-ii" else stiffness
+        settings |= {"stiffness": k, setting: shape}
+        if case.off is not None:
+            parameters = {"k_nm_rad": case.off[0] * k, name: low + case.off[1] * (shape - low)}
+    motor = Motor(
+        inertia_kg_m2=inertia * (1.05 if effect == "inertia 5 % off" else 1.0),
+        viscous_damping_nm_s_rad=damping * (0.8 if effect == "damping 20 % off" else 1.0),
+        transmission=Transmission(model=case.model, order=case.order, parameters=parameters),
+    )
+    world = simulate(**settings)
+    model = JointModel(arrangement="single", motors=(motor,))
+    return Drawn(model, world.record, world.stiffness_nm_rad)
+
+
+def online(joint: Drawn, mode: str) -> scene.Row:
     """Run a mode over a recording: what is judged, alarms, effects named and after how long, µs a tick.
 
     Judged is what is usable after five seconds; NaN where nothing ever is.
     """
-    estimator = make_estimator(drawn.model, EstimatorSettings(mode=mode), T)
+    estimator = make_estimator(joint.model, EstimatorSettings(mode=mode), T)
     after, named, out, spent_s = np.nan, set(), [], 0.0
-    for sample in drawn.record.samples():
+    for sample in joint.record.samples():
         start = time.process_time()
         estimate = estimator.step(sample)
         spent_s += time.process_time() - start
@@ -199,7 +178,7 @@ def online(drawn: Drawn, mode: str) -> scene.Row:
         if sample.sequence % 250 == 0 and (names := estimator.core.undeclared(0)):
             named.update(names)
             after = sample.sequence * T if np.isnan(after) else after
-    truth, last = drawn.stiffness_nm_rad, set(estimator.core.undeclared(0))
+    truth, last = joint.stiffness_nm_rad, set(estimator.core.undeclared(0))
     stiffness, deviation, status = np.array(out).T
     status = status.astype(int)
     chosen = (status & USABLE == USABLE) & (np.arange(len(truth)) * T >= SETTLED_S)
@@ -251,12 +230,11 @@ def summary(case: str, found: list[scene.Row]) -> scene.Row:
 
 def rows(args) -> Iterator[scene.Row]:
     """One row a spring, or with --undeclared an effect."""
-    for case in args.cases or (EFFECTS if args.undeclared else CASES):
-        if args.undeclared:
-            drawn = draw_undeclared(case, args.joints, args.seconds, args.motion)
-        else:
-            drawn = draw_joints(case, args.joints, args.seconds, args.seed)
-        yield summary(case, [online(joint, args.mode) for joint in drawn])
+    for name in args.cases or (EFFECTS if args.undeclared else CASES):
+        case, effect = (CASES["cubic"], name) if args.undeclared else (CASES[name], "nothing")
+        seeds = range(args.first, args.first + args.joints)
+        made = (drawn(case, effect, seed, args.seconds, args.motion) for seed in seeds)
+        yield summary(name, [online(joint, args.mode) for joint in made])
 
 
 COLUMNS = {
@@ -283,7 +261,7 @@ if __name__ == "__main__":
         scene.Option("--mode", ("robust", "paper")),
         scene.Option("--joints", 8),
         scene.Option("--seconds", 20.0),
-        scene.Option("--seed", 1, "of the springs"),
+        scene.Option("--first", 1, "seed of the first joint"),
         scene.Option("--undeclared", False, "effects that no file names"),
         scene.Option("--motion", ("multisine", "point-to-point", "hand-guided", "pushes", "harmonic")),
         scene.Option("--cases", [], "of springs or effects; all if left out"),

@@ -17,12 +17,12 @@
 enum { SUBSTEPS = 20, SINES = 7, STATES = 6, LONGEST_DELAY = 1000 };
 static const double PI = 3.14159265358979323846;
 
-enum spring { LINEAR, CUBIC, EXPONENTIAL };
+enum spring { LINEAR, CUBIC, EXPONENTIAL, VSA_II };
 enum friction { NO_FRICTION, COULOMB, STRIBECK, LUGRE };
 enum memory { NO_MEMORY, DAHL, BOUC_WEN };
 enum motion { MULTISINE, POINT_TO_POINT, HAND_GUIDED, PUSHES, HARMONIC, PLAYED };
 
-static double spring, stiffness = 150, cubic = 5000, exponent = 6, inertia = 0.12, damping = 0.8;
+static double spring, stiffness = 150, cubic = 5000, exponent = 6, linkage = 1.75, inertia = 0.12, damping = 0.8;
 static double link_inertia = 0.45, link_damping = 0.5, gravity = 3;
 static double friction, coulomb = 0.3, stribeck = 0.5, stribeck_velocity = 0.05, bristle = 2e-3, bristle_damping = 0.3;
 static double gear_loss, hysteresis, hysteresis_torque = 0.3, hysteresis_width = 4e-3, backlash, rounding = 0.25;
@@ -34,10 +34,11 @@ static const struct setting {
     double *value;
     const char *words, *meaning;
 } SETTINGS[] = {
-    {"spring", &spring, "linear cubic exponential", "f(φ)"},
-    {"stiffness", &stiffness, 0, "K, N·m/rad at φ = 0"},
+    {"spring", &spring, "linear cubic exponential vsa-ii", "f(φ)"},
+    {"stiffness", &stiffness, 0, "K, N·m/rad at φ = 0; k of the VSA-II"},
     {"cubic", &cubic, 0, "K3 of K φ + K3 φ³, N·m/rad³"},
     {"exponent", &exponent, 0, "b of K/b (exp(b|φ|) - 1), 1/rad"},
+    {"linkage", &linkage, 0, "C of the VSA-II: 2 k β β', β = asin(C sin(φ/2)) - φ/2"},
     {"inertia", &inertia, 0, "B of the motor, kg·m²"},
     {"damping", &damping, 0, "D of the motor, N·m·s/rad"},
     {"link_inertia", &link_inertia, 0, "M, kg·m²"},
@@ -132,6 +133,11 @@ static double spring_torque(double phi, double *slope) {
     } else if (spring == EXPONENTIAL) {
         torque = copysign(stiffness / exponent * expm1(exponent * fabs(x)), x);
         k = stiffness * exp(exponent * fabs(x));
+    } else if (spring == VSA_II) {
+        double u = linkage * sin(x / 2), root = sqrt(1 - u * u), beta = asin(u) - x / 2;
+        double c = linkage / 2 * cos(x / 2), turn = c / root - 0.5;
+        torque = 2 * stiffness * beta * turn;
+        k = 2 * stiffness * (turn * turn + beta * (u * c * c / pow(root, 3) - u / 4 / root));
     }
     *slope = k * inner;
     return torque;

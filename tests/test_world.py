@@ -37,9 +37,17 @@ def world(tmp_path_factory):
 EXACT = ("motor_counts=0", "link_bits=0", "seconds=3")
 
 
-def test_the_joint_without_effects_is_that_of_another_integrator(world):
-    _, c, _ = world("spring=cubic", *EXACT)
-    plants = joints.Plants(*joints.polynomial(np.array([[[150.0, 5000.0]]])), 0.12, 0.8, 0.45, 0.5, 3.0)
+@pytest.mark.parametrize(
+    ("spring", "law"),
+    [
+        (("spring=cubic",), joints.polynomial(np.array([[[150.0, 5000.0]]]))),
+        (("spring=vsa-ii", "stiffness=500"), joints.vsa_ii(np.array([[500.0]]), np.array([[1.75]]))),
+    ],
+    ids=["cubic", "vsa-ii"],
+)
+def test_the_joint_without_effects_is_that_of_another_integrator(world, spring, law):
+    _, c, _ = world(*spring, *EXACT)
+    plants = joints.Plants(*law, 0.12, 0.8, 0.45, 0.5, 3.0)
     truth = joints.simulate(plants, c["motor1_torque_nm"][:, None, None], 1e-3)
     for name, expected in (
         ("motor1_position_rad", truth.theta),

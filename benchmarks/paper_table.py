@@ -2,30 +2,29 @@
 
     python benchmarks/paper_table.py
 
-The three cases of section V, noise-free: torque held over each 1 ms period, the motion integrated by
-`tests/joints.py`. "raw" is the paper as printed, correctly discretised;
-"matched" passes the regressors through the residual's own filter.
+The three cases of section V (`sim/cases.py`), noise-free, torque held over each 1 ms period. "raw" is the
+paper as printed, correctly discretised; "matched" passes the regressors through the residual's own filter.
 
-Units of the table are the paper's (N·mm); inside everything is SI. The paper prints no inertias, damping
-or gravity for the VSA-II; what is assumed here stands in `VSA`. Its torque of 10 N·mm reaches |phi| = 0.07
-rad, its polynomial fits 0.45 rad: ten times the torque is used, the printed one is listed too.
+Units of the table are the paper's (N·mm); inside everything is SI. Ten times the printed torque of the VSA-II
+is used, the printed one is listed too: its 10 N·mm reaches |phi| = 0.07 rad, its polynomial fits 0.45 rad.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scene
 from numpy.typing import NDArray
-from scene import joints
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.signal import bilinear, lfilter
 
 from estimator.transmissions import MODELS
+from sim.cases import case
+from sim.plant import MotorPlant
+from sim.world import record
 
 Array = NDArray[np.float64]
 COLUMNS = ("quantity", "paper", "ours, raw", "ours, matched filters", "truth")
@@ -34,46 +33,32 @@ N = 10_000
 K_TAU = 300.0
 POLE = math.exp(-K_TAU * T)
 GAMMA = 1e-2 * 1e-6  # the paper's threshold is in (N·mm)²
-ALPHA = {"A": (0.1,), "B": (0.1, 0.5), "C": (0.5, 1.75)}
-SINGLE = {"B": 0.05, "D": 0.001, "M": 0.1, "Dq": 1e-4, "g": 0.025}
-VSA = {"B": 5e-4, "D": 5e-3, "M": 3e-3, "Dq": 1e-3, "g": 0.2943}  # assumed: the paper gives none
+CASES = {"A": "constant", "B": "quadratic", "C": "vsa-ii"}
 
 
-@dataclass
-class Motion:
-    """One simulated case: (N,) and (N, m) arrays, SI."""
+class Motion(NamedTuple):
+    """One simulated case: (N, m) arrays, SI; its motors' constants."""
 
     theta: Array
     omega: Array
-    q: Array
-    dq: Array
     tau: Array
-    tau_e: Array
+    phi: Array
     sigma: Array
-    constants: dict[str, float]
-
-    @property
-    def phi(self) -> Array:
-        return self.q[:, None] - self.theta
-
-    @property
-    def phi_rate(self) -> Array:
-        return self.dq[:, None] - self.omega
+    phi_rate: Array
+    motor: MotorPlant
 
 
-def simulate(case: str, amplitude_nm: float = 0.01) -> Motion:
-    """Eqs 4-7 from rest under the paper's torques, held over each period."""
-    m = 2 if case == "C" else 1
-    c, alpha = (VSA if case == "C" else SINGLE), ALPHA[case]
-    tau = amplitude_nm * np.sin(np.outer(np.arange(N) * T, 0.1 * np.pi * (1 + np.arange(m))))
-    one = np.ones(1)
-    torque, stiffness = (
-        joints.vsa_ii(*(one * x for x in alpha)) if case == "C" else joints.polynomial(np.array([[alpha]]))
+def simulate(name: str, **excitation: float) -> Motion:
+    """Eqs 4-7 from rest under the paper's torques, held over each period; or with another `amplitude_nm`."""
+    given = case(CASES[name])
+    columns = record(given.world(excitation={**given.excitation, **excitation}), N * T)
+    fields = ("position_rad", "velocity_rad_s", "torque_nm", "deflection_rad", "stiffness_nm_rad")
+    motors = range(1, len(given.drives) + 1)
+    theta, omega, tau, phi, sigma = (
+        np.stack([columns[f"truth_motor{i}_{field}"] for i in motors], axis=1) for field in fields
     )
-    plants = joints.Plants(torque, stiffness, *(one * c[name] for name in ("B", "D", "M", "Dq", "g")))
-    made = joints.simulate(plants, tau[:, None, :], T)
-    theta, omega, tau_e, sigma = (x[:, 0] for x in (made.theta, made.omega, made.tau_e, made.sigma))
-    return Motion(theta, omega, made.q[:, 0], made.q_rate[:, 0], tau, tau_e, sigma, c)
+    rate = columns["truth_link_velocity_rad_s"][:, None] - omega
+    return Motion(theta, omega, tau, phi, sigma, rate, given.plant.motors[0])
 
 
 def residual(motion: Motion, i: int) -> tuple[Array, Array]:
@@ -81,9 +66,9 @@ def residual(motion: Motion, i: int) -> tuple[Array, Array]:
 
     r_k = a r_(k-1) + (1 - a) (y_k - y_(k-1)) / T with a = exp(-K T): exact for a straight y.
     """
-    c = motion.constants
+    motor = motion.motor
     held = np.concatenate([[0.0], np.cumsum(motion.tau[:-1, i]) * T])
-    y = c["B"] * motion.omega[:, i] + c["D"] * motion.theta[:, i] - held
+    y = motor.inertia_kg_m2 * motion.omega[:, i] + motor.viscous_damping_nm_s_rad * motion.theta[:, i] - held
     y -= y[0]
     gain = (1.0 - POLE) / T
     return y, lfilter([gain, -gain], [1.0, -POLE], y)
@@ -183,7 +168,7 @@ def iterated(motion: Motion, i: int) -> tuple[Array, int]:
 
 def rows(_args: Any) -> Iterator[scene.Row]:
     """One row a figure of the paper."""
-    motions = {"A": simulate("A"), "B": simulate("B"), "C": simulate("C", 0.1)}
+    motions = {name: simulate(name) for name in CASES}
     order = {"A": 1, "B": 2, "C": 5}  # what the paper reports
 
     def both(name: str, i: int = 0, best: int | None = None) -> tuple[str, str]:
@@ -203,7 +188,7 @@ def rows(_args: Any) -> Iterator[scene.Row]:
     paper = ("499.22, 1.7536, 55 it.", "499.96, 1.7527, 32 it.")
     for i in range(2):
         (k, c), steps = iterated(motions["C"], i)
-        projected, small = nonlinear(motions["C"], i), nonlinear(simulate("C"), i)
+        projected, small = nonlinear(motions["C"], i), nonlinear(simulate("C", amplitude_nm=0.01), i)
         ours = "{k_nmm_rad:.4f}, {c:.6f}, {iterations} eval.".format(**projected)
         yield _row(
             f"C: k, C of transmission {i + 1}",

@@ -42,7 +42,6 @@ class DataSheet:
     product_name: str = ""  # as the file has it
     vendor_id: int = 0  # VendorNumber, or 0x1018:01; 0 where neither gives it
     product_code: int = 0  # ProductNumber, or 0x1018:02
-    revision: int = 0  # RevisionNumber, or 0x1018:03
     objects: dict[Address, ODVariable] = field(default_factory=dict)  # by (index, subindex)
     problems: list[str] = field(default_factory=list)  # problems of the file, one line each
 
@@ -239,7 +238,6 @@ def _device(sections: Sections, sheet: DataSheet) -> None:
         sheet.problems.append(f"[DeviceInfo] has no value for {', '.join(empty)}")
     sheet.vendor_id = _number(info.get("vendornumber", "")) or sheet.value(0x1018, 1) or 0
     sheet.product_code = _number(info.get("productnumber", "")) or sheet.value(0x1018, 2) or 0
-    sheet.revision = _number(info.get("revisionnumber", "")) or sheet.value(0x1018, 3) or 0
 
 
 def _move_to_node(sheet: DataSheet, made_for: int | None, node: int) -> None:

@@ -41,7 +41,6 @@ class Vendor:
     # counts per second and count of 0x606C, where 0x60A9 does not give it
     velocity_counts_s: float | None = None
     sensorless: Address | None = None  # object of 0x60E4 that is a sensorless estimate
-    toggling_statusword_bits: int = 0  # bits of 0x6041 that change by themselves
     # (object, its like): the maker's drives that have this object and not `counts_per_rev` are another
     # generation
     others: tuple[tuple[Address, Vendor], ...] = ()
@@ -87,7 +86,7 @@ VENDORS = {
     0x000000AB: Vendor(name="Copley", velocity_counts_s=0.1),
     0x0000026C: Vendor(name="Nanotec", sensorless=(0x60E4, 1)),
     0x000022D2: Vendor(name="Synapticon"),
-    0x00000002: Vendor(name="Beckhoff", toggling_statusword_bits=1 << 10),
+    0x00000002: Vendor(name="Beckhoff"),
     0x00000082: Vendor(name="Infranor"),
     0x000000BD: Vendor(name="Kollmorgen"),
     0x00000147: Vendor(name="Faulhaber"),

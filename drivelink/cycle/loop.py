@@ -158,15 +158,11 @@ class CycleLoop:
         Args:
             start_ns: stamp of the first SYNC; the others follow by periods.
         """
-        for stamp_ns in self.stamps(cycles, start_ns):
+        for stamp_ns in range(start_ns, start_ns + cycles * self.period_ns, self.period_ns):
             self.clock = partial(int, stamp_ns)
             self.tick(stamp_ns)
             self.receive()
             self.housekeeping.run(stamp_ns, self.period_ns)
-
-    def stamps(self, cycles: int, start_ns: int) -> range:
-        """Return the stamps of so many SYNCs on time."""
-        return range(start_ns, start_ns + cycles * self.period_ns, self.period_ns)
 
     def tick(self, stamp_ns: int, jump: int = 1, deadline_ns: int | None = None) -> None:
         """Produce SYNC. Frames received before it belong to the previous cycle.

@@ -84,6 +84,14 @@ class _Node:
     found: Mismatch | None = None  # the value that is contradicted
 
 
+def contradicted(
+    signal: str, motor: int, text: str, amount: float | None = None, std: float | None = None
+) -> dict[str, Any]:
+    """Return a contradicted reading in the form of `Estimator.suspicion`."""
+    said = {"signal": signal, "motor": motor, "reason": "contradicted", "amount": amount, "std": std}
+    return {**said, "explains": True, "text": text}
+
+
 class RecentSamples:
     """The last samples of a joint."""
 
@@ -174,20 +182,10 @@ class ObjectCheck:
         return found
 
     def contradiction(self, assembler: Assembler) -> dict[str, Any] | None:
-        """Return what frames of a joint carry else than its nodes say, as `jointwatch.contradiction`
-        gives it; None: nothing.
-        """
+        """Return what frames of a joint carry else than its nodes say, see `contradicted`; None: nothing."""
         for node in self._nodes.values():
             if node.assembler is assembler and node.found is not None:
-                return {
-                    "signal": str(node.found.signal),
-                    "motor": node.motor,
-                    "reason": "contradicted",
-                    "amount": None,
-                    "std": None,
-                    "explains": True,
-                    "text": node.found.text,
-                }
+                return contradicted(str(node.found.signal), node.motor, node.found.text)
         return None
 
 

@@ -11,6 +11,7 @@ from drivelink._core import Assembler, NodeCounters
 from drivelink.canopen.emcy import drive_state
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.loop import LoopJoint
+from drivelink.cycle.objectcheck import contradicted
 from drivelink.cycle.pipeline import ResidualMonitor
 from drivelink.daemon.status import EventLog
 from estimator.sample import Status
@@ -60,15 +61,7 @@ def contradiction(assembler: Assembler) -> dict[str, Any] | None:
         first = "torque" if check == "current" else "position"
         signal = f"motor_{first}_or_{check}"
         what = f"{first} and {_WORDS[check]} of motor {motor} contradict each other"
-    return {
-        "signal": signal,
-        "motor": motor,
-        "reason": "contradicted",
-        "amount": failed["scale"] - 1.0,
-        "std": failed["std"],
-        "explains": True,
-        "text": what,
-    }
+    return contradicted(signal, motor, what, failed["scale"] - 1.0, failed["std"])
 
 
 _MODEL_ALARM = int(Status.MODEL_ALARM)

@@ -26,12 +26,12 @@ class EventLog:
     _KINDS = 4  # different events of one source within that time; further ones count as one
     _LINES = 64  # log lines within that time; further ones are counted
 
-    def __init__(
-        self, logger: logging.Logger, keep: int = 16, clock: Callable[[], float] = time.time
-    ) -> None:
+    _KEPT = 16  # events for the status document
+
+    def __init__(self, logger: logging.Logger, clock: Callable[[], float] = time.time) -> None:
         self._logger = logger
         self._clock = clock
-        self._recent: deque[dict[str, Any]] = deque(maxlen=keep)
+        self._recent: deque[dict[str, Any]] = deque(maxlen=self._KEPT)
         self._active: dict[str, str] = {}
         self._said: dict[str, tuple[dict[str, Any], float, int]] = {}  # event, when logged, count since
         self._sources: dict[str, tuple[float, set[str]]] = {}  # when the first of the keys came, and the keys
@@ -62,10 +62,10 @@ class EventLog:
         self._active[key] = text
         self._note(f"{key} begins", text, level)
 
-    def end(self, key: str, text: str = "", level: int = logging.INFO) -> None:
+    def end(self, key: str, text: str = "") -> None:
         """Report that a condition has ended."""
         if self._active.pop(key, None) is not None and text:
-            self._note(f"{key} ends", text, level)
+            self._note(f"{key} ends", text, logging.INFO)
 
     def keep(self, key: str, holds: bool, text: str, over: str, level: int = logging.WARNING) -> None:
         """Report `text` when a condition begins to hold, `over` when it has ended."""

@@ -93,11 +93,6 @@ class Supervisor:
     def _overhear(self, cob_id: int, data: bytes) -> None:
         self._follower.feed(cob_id, data, self._loop.clock() / _NS)
 
-    @property
-    def receive_ids(self) -> tuple[int, ...]:
-        """Identifiers it listens to."""
-        return tuple(self._loop.listeners)
-
     def contradiction(self, loop_joint: LoopJoint) -> dict[str, Any] | None:
         """Return the reading that a second one contradicts, see `jointwatch`; None: none."""
         assembler = loop_joint.pipeline.assembler

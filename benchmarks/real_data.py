@@ -122,8 +122,7 @@ def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> 
 
     "on_line" is what the estimator said at each sample, "valid" how often it vouched for it, "twist" the
     stiffness times the measured twist. "external" is the external torque on what turns between the second
-    encoder and the sensor, where it is valid, against the sensor behind the same filter; "external_mean" is
-    its mean beside the sensor's, N·m.
+    encoder and the sensor, where it is valid, against the sensor behind the same filter.
     """
     behind = replace(model, link=LinkDynamics(inertia_kg_m2=BEHIND_KG_M2))
     estimator = make_estimator(behind, EstimatorSettings(), record.period_s)
@@ -156,7 +155,6 @@ def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> 
     return {
         "external": float(np.std(pushed - behind_filter) / np.std(behind_filter)),
         "external_valid": float(np.mean(np.isfinite(push[late]))),
-        "external_mean": (float(np.mean(pushed)), float(np.mean(behind_filter))),
         "on_line": error(np.array([one.flexibility_torque_nm for one in said])),
         "valid": float(np.mean([one.status & Status.VALID for one in said[late]])),
         "twist": error(twist),

@@ -20,7 +20,6 @@ from __future__ import annotations
 import argparse
 import ctypes
 import gc
-import json
 import logging
 import os
 import random
@@ -28,11 +27,13 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -53,22 +54,10 @@ FLAT_OBJECTS = 2000  # what is made once, at the first fault of a kind; a leak o
 COUNTS_FROM = (None, 0.1, -0.1, 2.6)  # rad beyond what it was; None: zero
 COUNTED = ("cycles", "estimates", "missed_cycles", "overruns")  # of a daemon's document
 _ON_ANY_BUS = {
-    *("mute", "delay", "resize", "repeat", "reverse", "drop_sync", "emergency", "mend", "kill", "revive"),
-    *(
-        "reboot",
-        "inject",
-        "ignore_sdo",
-        "refuse_sdo",
-        "impostor",
-        "banish",
-        "foreign_sync",
-        "babble",
-        "quiet",
-    ),
-    *("quiet", "babble_as", "unplug", "plug", "error_frame"),
-}
-
-
+    "mute", "delay", "resize", "repeat", "reverse", "drop_sync", "emergency", "mend", "kill", "revive",
+    "reboot", "inject", "ignore_sdo", "refuse_sdo", "impostor", "banish", "foreign_sync", "babble", "quiet",
+    "babble_as", "unplug", "plug", "error_frame",
+}  # fmt: skip
 _libc = ctypes.CDLL(None)
 
 
@@ -230,36 +219,45 @@ def _thirds(values: FloatArray) -> list[int]:
     return [int(np.median(part)) for part in (values[:third], values[-third:])]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--lockstep", action="store_true")
-    parser.add_argument("--two", type=float, default=0.3, help="share of faults beside which another begins")
-    parser.add_argument(
-        "--recount", type=float, default=0.0, help="share of reboots after which counts differ"
-    )
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+def rows(args: argparse.Namespace) -> Iterator[scene.Row]:
+    """One row; the exit status says what is wrong with it."""
     logging.getLogger("drivelink").setLevel(logging.CRITICAL)
     sys.setswitchinterval(0.0005)  # the bookkeeping here must not hold the daemon's thread up for long
-    result = Soak(options).run()
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(result, indent=1))
+    result = Soak(args).run()
+    yield result
     memory, objects = result["rss_kb"], result["objects"]
     flat = memory[1] < memory[0] + FLAT_KB and objects[1] < objects[0] + FLAT_OBJECTS
-    flat = flat and len(result["threads"]) == 1
     if result["wrong_episodes"]:
         sys.exit(f"{len(result['wrong_episodes'])} wrong episodes")
     if result["slowest_recovery_s"] >= WAY_BACK_S:
         sys.exit(f"{result['slowest_recovery_of']}: {result['slowest_recovery_s']} s until all was well")
-    sys.exit(0 if flat else "memory or threads are not flat")
+    if not flat or len(result["threads"]) != 1:
+        sys.exit("memory or threads are not flat")
 
+
+COLUMNS = {
+    "seconds": "{seconds:.0f}",
+    "cycles": "{cycles}",
+    "faults": "{faults}",
+    "samples checked": "{samples_checked}",
+    "wrong episodes": "{wrong_episodes}",
+    "slowest recovery": "{slowest_recovery_s:.1f} s: {slowest_recovery_of}",
+    "memory in thirds / kB": "{rss_kb[0]} → {rss_kb[1]}",
+    "objects": "{objects[0]} → {objects[1]}",
+    "threads": "{threads}",
+    "log lines": "{log_lines}",
+}
 
 if __name__ == "__main__":
     if os.environ.get("PYTHONMALLOC") != "malloc":
         os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, "PYTHONMALLOC": "malloc"})
-    main()
+    scene.main(
+        __doc__,
+        rows,
+        COLUMNS,
+        scene.Option("--seconds", 600.0),
+        scene.Option("--seed", 1),
+        scene.Option("--lockstep", False),
+        scene.Option("--two", 0.3, "share of faults beside which another begins"),
+        scene.Option("--recount", 0.0, "share of reboots after which counts differ"),
+    )

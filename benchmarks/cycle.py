@@ -4,10 +4,10 @@
 
 A two-motor VSA on the virtual bus. All variants make SYNC at 1 kHz for the same simulated devices, which
 answer in the thread that sends and whose CPU time is not counted, and publish in the same zenoh session to a
-subscriber in another process. Rounds alternate between them, so that all see the same machine. CPU is that of
-the whole process without the devices, over the SYNCs that were made, from the first one of each round on
-(locking memory and the collector's last look are of a start). Work is wall-clock time from the last PDO in
-hand to the put returned. SYNC is late by what passes from its deadline to the call that sends it.
+subscriber in another process. Each round begins with another variant, so that all see the same machine. CPU
+is that of the whole process without the devices, over the SYNCs that were made, from the first one of each
+round on (locking memory and the collector's last look are of a start). Work is wall-clock time from the last
+PDO in hand to the put returned. SYNC is late by what passes from its deadline to the call that sends it.
 
 In lockstep world, devices, frames, cycles and puts of one or several joints take one thread, as fast as it
 goes. The baseline of the start is Python with the libraries that any such program imports.
@@ -16,12 +16,14 @@ goes. The baseline of the start is Python with the libraries that any such progr
 from __future__ import annotations
 
 import math
+import signal
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +31,13 @@ import scene
 from rig import PERIOD_S, Devices, free_endpoint, joint, joint_text, subscriber
 from rivals import Floor, Textbook
 
-from drivelink.canopen.layout import NodeLayout, bus_load
+from drivelink.canopen.layout import bus_load
 from drivelink.cycle import realtime
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.jointfile import BusSection, JointFile
+from drivelink.jointfile import BusSection, JointFile, parse
 from drivelink.pubsub.session import close_session, open_session
 
-RECORDED = "drivelink, with a recorder"
+RECORDED, TEXTBOOK, FLOOR = "drivelink, with a recorder", Textbook.name, Floor.name
 LOCKSTEP = (("robust", 1), ("paper", 1), ("robust", 4), ("robust", 16))  # mode, joints
 LIBRARIES = "import canopen, can, numpy, zenoh"
 BARE = f"import time; {LIBRARIES}; print(time.monotonic()); print(open('/proc/self/status').read())"
@@ -102,24 +104,18 @@ class Row:
 
 
 def daemon_round(
-    row: Row,
-    which: JointFile,
-    devices: Devices,
-    session: Any,
-    seconds: float,
-    real_time: bool = True,
-) -> Mapping[int, NodeLayout]:
+    devices: Devices, session: Any, seconds: float, which: JointFile, row: Row, *, real_time: bool = True
+) -> None:
     """The daemon as `drivelink run` runs it, supervision, status key and housekeeping included."""
     served = [ServedJoint(joint=which)]
     with Daemon(served, session=session, real_time=real_time, devices=devices.poll) as daemon:
         row.measure(devices, lambda: daemon.run(seconds))
         (loop_joint,) = daemon.loop.loop_joints
         row.keep(loop_joint.estimates, work=loop_joint.work.total(), late=daemon.loop.lateness.total())
-        return dict(daemon.layouts)
 
 
 def rival_round(
-    row: Row, rival: Textbook | Floor, devices: Devices, seconds: float, real_time: bool = True
+    devices: Devices, seconds: float, rival: Textbook | Floor, row: Row, *, real_time: bool = True
 ) -> None:
     """A rival, with the same help of the operating system."""
     obtained = realtime.acquire(privileged=real_time)
@@ -129,39 +125,44 @@ def rival_round(
     rival.close()
 
 
-def recorded_round(row: Row, which: JointFile, text: str, devices: Devices, session, seconds: float) -> None:
+def recorded_round(devices: Devices, session: Any, seconds: float, text: str, row: Row) -> None:
     """The daemon while `drivelink record` writes everything into a file."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "bench.toml"
+        path, out = Path(folder) / "bench.toml", Path(folder) / "out.mcap"
         path.write_text(text, encoding="utf-8")
-        command = [sys.executable, "-m", "drivelink", "record", path, "--source", "daemon"]
-        command += ["--out", Path(folder) / "out.mcap", "--seconds", str(seconds + 3)]
+        command = [sys.executable, "-m", "drivelink", "record", path, "--source", "daemon", "--out", out]
         recorder = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(2.5)  # until it listens
-        daemon_round(row, which, devices, session, seconds)
+        while not out.exists() and recorder.poll() is None:  # until it listens
+            time.sleep(0.1)
+        daemon_round(devices, session, seconds, parse(text), row)
+        recorder.send_signal(signal.SIGINT)
         recorder.wait(timeout=60)
 
 
 def rows(args: Any) -> Iterator[scene.Row]:
-    """One row a variant, measured round by round."""
-    endpoint = free_endpoint()
+    """One row a variant, measured round by round; each round begins with another one."""
+    endpoint, seconds = free_endpoint(), args.seconds
     robust, paper = joint("robust", endpoint), joint("paper", endpoint)
     session = open_session(robust.zenoh, Path())
-    reader = subscriber(endpoint)
-    ordinary = ("drivelink, ordinary scheduling", "floor, ordinary scheduling")
-    names = ("drivelink, robust", "drivelink, paper", RECORDED, Textbook.name, Floor.name, *ordinary)
-    made = {name: Row(name) for name in names}
-    devices, seconds = Devices(robust), args.seconds
+    reader, devices = subscriber(endpoint), Devices(robust)
+    with Daemon([ServedJoint(joint=robust)], session=session, devices=devices.poll) as daemon:
+        layouts = dict(daemon.layouts)
+    run, rival = partial(daemon_round, devices, session, seconds), partial(rival_round, devices, seconds)
+    variants: dict[str, Callable[[Row], None]] = {
+        "drivelink, robust": partial(run, robust),
+        "drivelink, paper": partial(run, paper),
+        RECORDED: partial(recorded_round, devices, session, seconds, joint_text("robust", endpoint)),
+        TEXTBOOK: lambda row: rival(Textbook(paper, devices.network.nodes, layouts, session), row),
+        FLOOR: lambda row: rival(Floor(paper, layouts, session), row),
+        "drivelink, ordinary scheduling": partial(run, robust, real_time=False),
+        "floor, ordinary scheduling": lambda row: rival(Floor(paper, layouts, session), row, real_time=False),
+    }
+    made = {name: Row(name) for name in variants}
     try:
-        for _ in range(args.rounds):
-            layouts = daemon_round(made["drivelink, robust"], robust, devices, session, seconds)
-            daemon_round(made["drivelink, paper"], paper, devices, session, seconds)
-            recorded_round(made[RECORDED], robust, joint_text("robust", endpoint), devices, session, seconds)
-            textbook = Textbook(paper, devices.network.nodes, layouts, session)
-            rival_round(made[Textbook.name], textbook, devices, seconds)
-            rival_round(made[Floor.name], Floor(paper, layouts, session), devices, seconds)
-            daemon_round(made[ordinary[0]], robust, devices, session, seconds, real_time=False)
-            rival_round(made[ordinary[1]], Floor(paper, layouts, session), devices, seconds, real_time=False)
+        for first in range(args.rounds):
+            order = list(variants)[first:] + list(variants)[:first]
+            for name in order:
+                variants[name](made[name])
     finally:
         devices.close()
         close_session(session)
@@ -170,9 +171,9 @@ def rows(args: Any) -> Iterator[scene.Row]:
     cost = {row["variant"]: row["cpu_us_per_cycle"] for row in results}
     load = bus_load(layouts.values(), BusSection(period_s=PERIOD_S)).fraction
     for row in results:
-        for name, rival in (("textbook", Textbook), ("floor", Floor)):
-            row[f"cpu_against_{name}"] = row["cpu_us_per_cycle"] / cost[rival.name]
-        yield row | {"bus_load_1_mbit": load}
+        own = row["cpu_us_per_cycle"]
+        compared = {"cpu_against_textbook": own / cost[TEXTBOOK], "cpu_against_floor": own / cost[FLOOR]}
+        yield row | compared | {"bus_load_1_mbit": load}
 
 
 def lockstep(mode: str, joints: int, seconds: float) -> scene.Row:

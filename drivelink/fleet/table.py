@@ -26,7 +26,6 @@ FOLDER = "table"
 
 _PART_ROWS = 5000  # a part is full: about 2 MB, rewritten in some 0.1 s
 _FLUSH_S = 5.0  # finished work that a power loss may cost
-_FLUSH_SHARE = 0.05  # share of the time for writing
 
 _TEXT, _REAL, _FEW, _MANY = pa.string(), pa.float64(), pa.int16(), pa.int64()
 _TIME = pa.timestamp("us", tz="UTC")
@@ -81,7 +80,7 @@ class FleetTable:
         self._now: set[_Key] = set()
         self._rows: list[dict[str, Any]] = []
         self._part = _new_part()
-        self._flushed, self._cost = time.monotonic(), 0.0
+        self._flushed = time.monotonic()
         rows = [row for part in self._parts for row in _read(store, part, _INDEX).to_pylist()]
         for row, current in zip(rows, _current(rows), strict=True):
             if current:
@@ -124,7 +123,7 @@ class FleetTable:
             self._remember(row)
         self._now.add((rows[0]["digest"], rows[0]["joint"]))
         full = len(self._rows) >= _PART_ROWS
-        if full or time.monotonic() - self._flushed > max(_FLUSH_S, self._cost / _FLUSH_SHARE):
+        if full or time.monotonic() - self._flushed > _FLUSH_S:
             self.flush()
         if full:
             self._rows, self._part = [], _new_part()
@@ -137,12 +136,10 @@ class FleetTable:
         """
         if not self._rows:
             return
-        begin = time.monotonic()
         self._store.write(self._part, _bytes(pa.Table.from_pylist(self._rows, SCHEMA)))
         if self._part not in self._parts:
             self._parts.append(self._part)
         self._flushed = time.monotonic()
-        self._cost = self._flushed - begin
 
     def _remember(self, row: dict[str, Any]) -> None:
         failed = row["status"] != "done"

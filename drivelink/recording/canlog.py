@@ -79,11 +79,7 @@ class LoggedFrame(NamedTuple):
     channel: str  # its interface, by the log's name
 
 
-# (1436509052.249713) vcan0 044#2A366C2BBA R          candump -L, to the letter
-_PLAIN = re.compile(
-    r"^\((\d{1,11})\.(\d{6})\) (\S+) ([0-9A-F]{3})#((?:[0-9A-F]{2})*)(?: [RT])?\n", re.MULTILINE
-)
-# … brackets or none
+# (1436509052.249713) vcan0 044#2A366C2BBA R          candump -L; brackets or none
 _COMPACT = re.compile(
     rb"^[ \t]*(?:\(?(\d{1,11})[.,](\d+)\)?[ \t]+)?(\S+)[ \t]+([0-9A-Fa-f]{1,8})#"
     rb"(#[0-9A-Fa-f])?([0-9A-Fa-f.]*)(R?)"
@@ -180,14 +176,9 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
             end = block.rfind(b"\n") + 1
             _require_end(file, len(block) - end, path)
             block = block[:end]
-        plain = _PLAIN.findall(block.decode("latin-1"))
-        if plain and len(plain) == block.count(b"\n"):
-            tolerant.skip(len(plain))
-            yield from _plain_frames(plain)
-        else:
-            yield from tolerant.frames(block)
-            if tolerant.hopeless:
-                break
+        yield from tolerant.frames(block)
+        if tolerant.hopeless:
+            break
     if not tolerant.understood:
         raise RecordingError(
             f"{path}: expected lines as candump writes them, got {tolerant.first_strange or 'none'}"
@@ -212,14 +203,6 @@ def _require_end(file: IO[bytes], length: int, path: Path) -> None:
     _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
 
 
-def _plain_frames(lines: list[tuple[str, ...]]) -> Iterator[LoggedFrame]:
-    """The frames of a block in the exact format of candump -L; much faster than line by line."""
-    seconds, micros, channels, ids, data = zip(*lines, strict=True)
-    stamps = [int(s + us) * 1000 for s, us in zip(seconds, micros, strict=True)]
-    frames = map(LoggedFrame, stamps, [int(i, 16) for i in ids], map(bytes.fromhex, data), channels)
-    return (frame for frame in frames if frame.can_id <= _LAST_ID and len(frame.data) <= _LONGEST)
-
-
 class _Lines:
     """Reads lines one by one, in both formats of candump, tolerating foreign lines."""
 
@@ -234,11 +217,6 @@ class _Lines:
     def hopeless(self) -> bool:
         """Whether this is not a log."""
         return not self.understood and self.strange > _HOPELESS
-
-    def skip(self, lines: int) -> None:
-        """Count lines that were understood elsewhere."""
-        self._number += lines
-        self.understood += lines
 
     def frames(self, block: bytes) -> Iterator[LoggedFrame]:
         """Yield the data frames with 11-bit identifiers among the lines of a block."""

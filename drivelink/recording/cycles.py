@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from itertools import islice
 from typing import NamedTuple
 
 from drivelink._core import SYNC_COB_ID, JointPipeline, Tick
@@ -17,12 +16,11 @@ from drivelink.cycle.following import follow_log
 from drivelink.cycle.objectcheck import RecentSamples
 from drivelink.cycle.pipeline import make_assembler
 from drivelink.cycle.syncclock import SyncClock, measure_period
-from drivelink.errors import DriveError, DrivelinkError
+from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import NO_STAMP, LoggedFrame
 from estimator.sample import Sample
 
-_BATCH = 512
 OF_SDO = range(0x581, 0x680)
 OF_MAPS = frozenset({0, *OF_SDO, *range(0x701, 0x780)})  # NMT, SDO, boot-up
 
@@ -37,26 +35,12 @@ class Cycle(NamedTuple):
 
 
 def estimated(cycles: Iterable[Cycle], pipeline: JointPipeline) -> Iterator[Tick]:
-    """Pass the cycles through the pipeline; yield the output that the live loop publishes.
-
-    Reading and estimating alternate in batches, which is faster than per cycle.
-    """
-    source = iter(cycles)
-    error: DrivelinkError | None = None
-    while error is None:
-        batch: list[Cycle] = []
-        try:
-            batch.extend(islice(source, _BATCH))
-        except DrivelinkError as broken:  # raised after what came before it
-            error = broken
-        if not batch and error is None:
-            return
-        for sequence, stamp_ns, sample, flags in batch:
-            if sample is not None:
-                yield pipeline.take(sample, flags, stamp_ns)
-            elif (tick := pipeline.carry_on(sequence, flags, stamp_ns)) is not None:
-                yield tick
-    raise error
+    """Pass the cycles through the pipeline; yield the output that the live loop publishes."""
+    for sequence, stamp_ns, sample, flags in cycles:
+        if sample is not None:
+            yield pipeline.take(sample, flags, stamp_ns)
+        elif (tick := pipeline.carry_on(sequence, flags, stamp_ns)) is not None:
+            yield tick
 
 
 _AHEAD = 64  # later SYNCs used to number one

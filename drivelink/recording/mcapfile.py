@@ -53,7 +53,6 @@ _WANTED = frozenset({_CHANNEL, _MESSAGE_OP, _CHUNK_OP})
 _MOST_RATIO = 64  # of unpacked bytes to those of the file: of a joint at rest they are some 30
 _SMALL_BYTES = 16 << 20  # that any file may unpack to
 _MESSAGE_BYTES = 64 << 10  # of a sample, an estimate or a frame: ours have some 500
-_scan = json.JSONDecoder().raw_decode
 _ZSTD_WINDOW = 128 << 20  # memory limit of its decoder, the same as in zstd's tools
 
 
@@ -162,13 +161,7 @@ def message_fields(data: bytes) -> dict[str, Any]:
         raise ValueError(f"expected at most {_MESSAGE_BYTES >> 10} KiB, got {len(data) >> 10} KiB")
     if b"[" in data or data.count(b"{") > 1:
         raise ValueError("expected a JSON object without others or lists in it")
-    text = data.decode()
-    try:
-        fields, end = _scan(text, 0)  # without the work of `loads` beside it, two thirds of its time
-    except ValueError:
-        end = -1
-    if end != len(text):
-        fields = json.loads(text)
+    fields = json.loads(data.decode())
     if not isinstance(fields, dict):
         raise ValueError(f"expected a JSON object, got {data[:40]!s}")
     return fields

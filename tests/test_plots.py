@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from drivelink.output import plots
-from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save
-from drivelink.output.plots import stiffness_against_deflection as against_deflection
+from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
 
 
 def wave(n=20_000):
@@ -25,14 +24,11 @@ def test_curves_differ_in_line_style_marker_and_lightness_not_only_in_colour():
     assert np.diff(lightness).min() > 20
 
 
-def test_stiffness_over_scattered_deflections_becomes_one_curve():
+def test_scattered_samples_become_one_curve():
     t, phi, sigma = wave()
-    rng = np.random.default_rng(1)
-    _, (axes,) = new_figure()
-    noisy = sigma + rng.normal(0, 5, len(t))
-    against_deflection(axes, {"estimate": PlotCurve(phi, noisy, np.full(len(t), 5.0))})
-    x, y = (np.asarray(values, float) for values in axes.lines[0].get_data())
-    assert len(x) < 500 and np.all(np.diff(x) > 0)
+    noisy = sigma + np.random.default_rng(1).normal(0, 5, len(t))
+    x, y, std = medians(phi, noisy, std=np.full(len(t), 5.0))
+    assert len(x) < 500 and np.all(np.diff(x) > 0) and np.all(std == 5.0)
     inside = np.abs(x) < 0.095  # the outermost bins average over the steepest part
     # The median of some 80 samples a bin: 5 N·m/rad * 1.25 / sqrt(80) = 0.7, four of them are a wide bound.
     assert np.nanmax(np.abs(y - 100.0 - 3000.0 * x**2)[inside]) < 2.8
@@ -68,8 +64,8 @@ def test_what_is_not_finite_or_constant_or_empty_can_be_drawn(tmp_path):
     figure, axes = new_figure("title", rows=3)
     nan = np.full(5000, np.nan)
     over_time(axes[0], {"a": PlotCurve(nan, nan, nan)}, "y")
-    against_deflection(axes[1], {"a": PlotCurve(np.zeros(5000), np.ones(5000), nan)})
-    against_deflection(axes[2], {"a": PlotCurve(np.zeros(0), np.zeros(0))})
+    xy(axes[1], {"a": medians(np.zeros(5000), np.ones(5000), std=nan)}, "x", "y")
+    xy(axes[2], {"a": medians(np.zeros(0), np.zeros(0)), "b": medians(nan, nan)}, "x", "y")
     for count in (1, 2, 5, 100, 1000):
         x = np.linspace(0.0, 1.0, count)
         curve = medians(x, 2.0 * x)

@@ -212,4 +212,4 @@ def _residuals(axes: Sequence[Axes], one: TransmissionFit, units: Units) -> None
 
 
 def _line(x: FloatArray, y: FloatArray) -> plots.PlotCurve:
-    return plots.medians(x, y, max(4, len(x) // _IN_BIN)) if len(x) else plots.PlotCurve(x, y)
+    return plots.medians(x, y, max(4, len(x) // _IN_BIN))

@@ -3,7 +3,7 @@
 Figures are made without pyplot: no global state, no window, safe in any thread.
 
     figure, axes = new_figure("Elbow", rows=2)
-    stiffness_against_deflection(axes[0], {"estimate": PlotCurve(phi, sigma, std)})
+    xy(axes[0], {"estimate": medians(phi, sigma, std=std)}, "deflection / rad", "stiffness / (N·m/rad)")
     over_time(axes[1], {"flexibility torque": PlotCurve(t, torque)}, "torque / N·m")
     save(figure, Path("joint.png"))
 """
@@ -20,7 +20,6 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy.stats import binned_statistic
 
 from drivelink.files import write_whole
 from estimator.sample import SIGMA_95, FloatArray
@@ -56,7 +55,6 @@ _THEMED = {
     **{color: f"var(--curve-{k}, {color})" for k, color in enumerate(COLORS, 1) if color not in _INK},
 }
 _MAX_POINTS = 4000  # curves with more points are reduced to the extremes of each pixel column
-_BINS = 240
 _MIN_OF_SCATTERED = 3  # samples in a bin of `medians`
 _MARKERS_A_CURVE = 12
 
@@ -102,15 +100,6 @@ def over_time(axes: Axes, curves: Mapping[str, PlotCurve], y_label: str, title: 
     xy(axes, curves, "time / s", y_label, title)
 
 
-def stiffness_against_deflection(axes: Axes, curves: Mapping[str, PlotCurve], title: str = "") -> None:
-    """Draw stiffness over deflection: samples in any order become one curve, the median in each bin.
-
-    The band is the 95 % interval: 1.96 times the median standard deviation of the bin.
-    """
-    binned = {name: _binned(curve) for name, curve in curves.items()}
-    xy(axes, binned, "deflection / rad", "stiffness / (N·m/rad)", title)
-
-
 def save(figure: Figure, path: Path) -> Path:
     """Write the figure in the format of the file name's ending (png, svg, pdf)."""
     write_whole(path, _drawn(figure, path.suffix[1:]), force=True)
@@ -142,8 +131,12 @@ def _drawn(figure: Figure, kind: str, *, transparent: bool = False) -> bytes:
     return buffer.getvalue()
 
 
-def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> PlotCurve:
-    """Return medians of scattered samples in bins of x, without the outermost x."""
+def medians(x: FloatArray, y: FloatArray, bins: int = 80, std: FloatArray | None = None) -> PlotCurve:
+    """Return medians of scattered samples, and of their deviations, in bins of x, without the outermost x."""
+    known = np.isfinite(x) & np.isfinite(y)
+    x, values = x[known], [one[known] for one in (y, std) if one is not None]
+    if not len(x):
+        return PlotCurve(x, *values)
     low, high = np.quantile(x, [0.002, 0.998])
     least = min(_MIN_OF_SCATTERED, len(x))
     bins = min(bins, max(1, len(x) // least))  # one of them, at least, is full
@@ -151,7 +144,9 @@ def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> PlotCurve:
     place = np.clip(np.searchsorted(edges, x) - 1, 0, bins - 1)
     middle = 0.5 * (edges[1:] + edges[:-1])
     filled = [k for k in range(bins) if np.count_nonzero(place == k) >= least]
-    return PlotCurve(middle[filled], np.array([np.median(y[place == k]) for k in filled]))
+    return PlotCurve(
+        middle[filled], *(np.array([np.median(one[place == k]) for k in filled]) for one in values)
+    )
 
 
 def dots(axes: Axes, x: FloatArray, y: FloatArray, name: str | None = None) -> None:
@@ -220,32 +215,17 @@ def _thinned(curve: PlotCurve) -> PlotCurve:
     return PlotCurve(curve.x[keep], curve.y[keep], None if curve.std is None else curve.std[keep])
 
 
-def _binned(curve: PlotCurve) -> PlotCurve:
-    """Scattered samples as one curve over x: the median of each bin; gaps where there are no samples."""
-    finite = np.isfinite(curve.x) & np.isfinite(curve.y)
-    x, y = curve.x[finite], curve.y[finite]
-    if len(x) <= _BINS or float(np.ptp(x)) == 0.0:
-        order = np.argsort(x, kind="stable")
-        return PlotCurve(x[order], y[order], None if curve.std is None else curve.std[finite][order])
-    edges = np.linspace(x.min(), x.max(), _BINS + 1)
-    values = [y] if curve.std is None else [y, curve.std[finite]]
-    middle = binned_statistic(x, values, "median", edges).statistic
-    return PlotCurve((edges[1:] + edges[:-1]) / 2, *middle)
-
-
 def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, title: str) -> Path:
     """Return the stiffness over deflection of each transmission; columns as in estimates.csv."""
     figure, axes = new_figure(title, height=3.6)
     seen = columns["observable"] > 0
-    curves = {
-        f"motor {i}": PlotCurve(
-            columns[f"motor{i}_deflection_rad"][seen],
-            columns[f"motor{i}_stiffness_nm_rad"][seen],
-            columns[f"motor{i}_stiffness_std_nm_rad"][seen],
-        )
-        for i in range(1, motors + 1)
-    }
-    stiffness_against_deflection(axes[0], curves, "Stiffness of the transmission, where observable")
+    names = ("deflection_rad", "stiffness_nm_rad", "stiffness_std_nm_rad")
+    curves = {}
+    for i in range(1, motors + 1):
+        phi, sigma, std = (columns[f"motor{i}_{name}"][seen] for name in names)
+        curves[f"motor {i}"] = medians(phi, sigma, std=std)
+    title = "Stiffness of the transmission, where observable"
+    xy(axes[0], curves, "deflection / rad", "stiffness / (N·m/rad)", title)
     return save(figure, path)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import logging
-import re
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -27,10 +27,8 @@ from estimator.sample import FloatArray
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_EMPTY = re.compile(
-    rb"(?:(?<=,)|(?<=\n)|^)[ \t\r]*+(?:null|none|n/a|na|-)?+[ \t\r]*+(?=,|\n|$)", re.IGNORECASE
-)
-_BLOCK = 1 << 20  # bytes per read; empty cells that are filled take 200 times as much
+_EMPTY = frozenset({"", "null", "none", "n/a", "na", "-"})  # cells without a value, in lower case
+_BLOCK = 1 << 20  # bytes per read; their numbers take some 20 times as much
 
 
 def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
@@ -158,57 +156,31 @@ def _blocks(file: IO[bytes], path: Path, line: int) -> Iterator[tuple[bytes, int
 
 def _numbers(block: bytes, layout: _Layout, path: Path, first_line: int) -> FloatArray:
     """(rows, used columns) numbers of some lines."""
-    even = _even(block, len(layout.names))
-    for attempt in ("as it is", "with empty cells filled") if even else ():
-        text = block if attempt == "as it is" else _EMPTY.sub(b"nan", block.rstrip())
-        try:
-            return np.loadtxt(
-                io.BytesIO(text),
-                dtype=np.float64,
-                delimiter=",",
-                ndmin=2,
-                comments="#",
-                quotechar='"',
-                usecols=layout.places,
-            )
-        except ValueError:
-            continue
-    raise RecordingError(_wrong_line(block, layout, path, first_line))
+    lines = (line.partition("#")[0] for line in io.StringIO(block.decode("utf-8", errors="replace")))
+    reader, table = csv.reader(lines), []
+    try:
+        for cells in reader:
+            if len(cells) == len(layout.names):
+                table.append(_row(cells, layout))
+            elif "".join(cells).strip():
+                raise ValueError(f"expected {len(layout.names)} columns, got {len(cells)}")
+    except (csv.Error, ValueError) as error:
+        raise RecordingError(f"{path}: line {first_line + reader.line_num - 1}: {error}") from error
+    return np.array(table, dtype=np.float64).reshape(-1, len(layout.places))
 
 
-def _even(block: bytes, width: int) -> bool:
-    """Whether every line has so many columns, which a reader of some columns does not check."""
-    if b"#" in block or b'"' in block or b"\n\n" in block or block.startswith(b"\n"):
-        lines = (line.partition("#")[0] for line in io.StringIO(block.decode("utf-8", errors="replace")))
-        try:
-            return all(len(cells) == width for cells in csv.reader(lines) if "".join(cells).strip())
-        except csv.Error:  # a cell too long
-            return False
-    data = np.frombuffer(block, dtype=np.uint8)
-    commas = np.flatnonzero(data == ord(","))
-    ends = np.flatnonzero(data == ord("\n"))
-    each = np.diff(np.searchsorted(commas, ends), prepend=0)
-    return bool(np.all(each == width - 1))
+def _row(cells: list[str], layout: _Layout) -> list[float]:
+    try:
+        return [float(cells[place]) for place in layout.places]
+    except ValueError:  # an empty cell, or a word
+        return [_number(cells[k].strip(), name) for k, name in zip(layout.places, layout.used, strict=True)]
 
 
-def _wrong_line(block: bytes, layout: _Layout, path: Path, first_line: int) -> str:
-    """Find the wrong line and cell after the fast reader failed."""
-    for number, line in enumerate(block.split(b"\n"), first_line):
-        text = line.decode("utf-8", errors="replace").partition("#")[0]
-        if not text.strip():
-            continue
-        try:
-            cells = next(csv.reader([text]))
-        except csv.Error as error:
-            return f"{path}: line {number}: {error}"
-        if len(cells) != len(layout.names):
-            return f"{path}: line {number}: expected {len(layout.names)} columns, got {len(cells)}"
-        for name, place in zip(layout.used, layout.places, strict=True):
-            try:
-                float(cells[place].strip() or "nan")
-            except ValueError:
-                return f"{path}: line {number}: {name}: expected a number, got {cells[place].strip()[:40]!r}"
-    return f"{path}: cannot be read as CSV"
+def _number(cell: str, name: str) -> float:
+    try:
+        return math.nan if cell.lower() in _EMPTY else float(cell)
+    except ValueError:
+        raise ValueError(f"{name}: expected a number, got {cell[:40]!r}") from None
 
 
 Columns = tuple[dict[str, FloatArray], tuple[str, ...]]

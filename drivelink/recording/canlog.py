@@ -10,7 +10,6 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime
-from io import BytesIO
 from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -63,7 +62,6 @@ _EXTENDED_DIGITS = 8
 _LAST_ID = 0x7FF
 _LONGEST = 64  # bytes of a frame, excluding CAN XL
 _LINE = 16 << 10  # bytes; candump's longest, of CAN XL, has 6 KiB
-_BLOCK = 1 << 18  # bytes per read
 _HOPELESS = 20  # unknown lines at the beginning after which it is not a log
 _DISORDER_NS = 1_000_000_000  # largest disorder of stamps within a file
 _GAP_NS = 1_000_000_000
@@ -167,85 +165,50 @@ def _text_frames(path: Path) -> Iterator[LoggedFrame]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
 
 
+_Parser = Callable[[bytes], LoggedFrame | None]
+
+
 def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
-    """The data frames with 11-bit identifiers; lines that are no frames are counted."""
-    tolerant = _Lines()
-    while block := file.read(_BLOCK):
-        block += file.readline(MAX_LINE_BYTES)
-        if not block.endswith(b"\n"):
-            end = block.rfind(b"\n") + 1
-            _require_end(file, len(block) - end, path)
-            block = block[:end]
-        yield from tolerant.frames(block)
-        if tolerant.hopeless:
+    """The data frames with 11-bit identifiers, in both formats of candump; foreign lines are counted."""
+    parsers: list[_Parser] = [_compact, _spaced]  # first that of the line before
+    understood = strange = 0  # lines that are frames, also omitted ones, and others
+    first_strange = ""
+    for number, line in enumerate(iter(lambda: file.readline(MAX_LINE_BYTES + 1), b""), start=1):
+        if not line.endswith(b"\n"):
+            if len(line) > MAX_LINE_BYTES:
+                raise RecordingError(f"{path}: expected lines of at most {MAX_LINE_BYTES >> 10} KiB")
+            _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
             break
-    if not tolerant.understood:
-        raise RecordingError(
-            f"{path}: expected lines as candump writes them, got {tolerant.first_strange or 'none'}"
-        )
-    if tolerant.strange:
-        _LOG.warning(
-            "%s: %d line(s) are not CAN frames and are omitted, first %s",
-            path,
-            tolerant.strange,
-            tolerant.first_strange,
-        )
-
-
-def _require_end(file: IO[bytes], length: int, path: Path) -> None:
-    """Check that only the last line has no end; it is omitted, because it may be incomplete.
-
-    Raises:
-        RecordingError: a line is too long.
-    """
-    if length >= MAX_LINE_BYTES or file.read(1):
-        raise RecordingError(f"{path}: expected lines of at most {MAX_LINE_BYTES >> 10} KiB")
-    _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
-
-
-class _Lines:
-    """Reads lines one by one, in both formats of candump, tolerating foreign lines."""
-
-    def __init__(self) -> None:
-        self.understood = 0  # number of lines that are frames, also omitted ones
-        self.strange = 0  # number of other lines
-        self._number = 0
-        self.first_strange = ""  # the first of them, as a warning shows it
-        self._parse: Callable[[bytes], LoggedFrame | None] = _compact
-
-    @property
-    def hopeless(self) -> bool:
-        """Whether this is not a log."""
-        return not self.understood and self.strange > _HOPELESS
-
-    def frames(self, block: bytes) -> Iterator[LoggedFrame]:
-        """Yield the data frames with 11-bit identifiers among the lines of a block."""
-        for line in BytesIO(block):
-            self._number += 1
-            if line.isspace() or line.lstrip().startswith((b"#", b";")):
-                continue
-            try:
-                frame = self._either(line)
-            except ValueError:
-                self.strange += 1
-                shown = repr(line.strip()[:60].decode(errors="replace"))
-                self.first_strange = self.first_strange or f"line {self._number}: {shown}"
-                if self.hopeless:
-                    return
-                continue
-            self.understood += 1
-            if frame is not None:
-                yield frame
-
-    def _either(self, line: bytes) -> LoggedFrame | None:
-        """The frame, first in the format of the previous line."""
-        if len(line) > _LINE:
-            raise ValueError
+        if line.isspace() or line.lstrip().startswith((b"#", b";")):
+            continue
         try:
-            return self._parse(line)
+            frame = _either(line, parsers)
         except ValueError:
-            self._parse = _spaced if self._parse is _compact else _compact
-            return self._parse(line)
+            strange += 1
+            shown = repr(line.strip()[:60].decode(errors="replace"))
+            first_strange = first_strange or f"line {number}: {shown}"
+            if not understood and strange > _HOPELESS:
+                break
+            continue
+        understood += 1
+        if frame is not None:
+            yield frame
+    if not understood:
+        raise RecordingError(f"{path}: expected lines as candump writes them, got {first_strange or 'none'}")
+    if strange:
+        text = "%s: %d line(s) are not CAN frames and are omitted, first %s"
+        _LOG.warning(text, path, strange, first_strange)
+
+
+def _either(line: bytes, parsers: list[_Parser]) -> LoggedFrame | None:
+    """The frame; a parser that understands it where the first does not becomes the first."""
+    if len(line) > _LINE:
+        raise ValueError
+    try:
+        return parsers[0](line)
+    except ValueError:
+        parsers.reverse()
+        return parsers[0](line)
 
 
 def _compact(line: bytes) -> LoggedFrame | None:

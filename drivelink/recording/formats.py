@@ -1,14 +1,14 @@
 """The formats of recordings, by the ending of the file's name: reader of columns (CSV), writer.
 
-A file is read in blocks of lines; only the numbers of known columns are kept in memory.
+A file is read line by line; only the numbers of known columns are kept in memory.
 """
 
 from __future__ import annotations
 
 import csv
-import io
 import logging
 import math
+from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -28,7 +28,6 @@ from estimator.sample import FloatArray
 _LOG = logging.getLogger("drivelink.recording")
 
 _EMPTY = frozenset({"", "null", "none", "n/a", "na", "-"})  # cells without a value, in lower case
-_BLOCK = 1 << 20  # bytes per read; their numbers take some 20 times as much
 
 
 def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
@@ -57,30 +56,21 @@ def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray
 def first_row(path: Path, names: ColumnMap) -> dict[str, FloatArray]:
     """Read the known columns of the first row, as `read_csv_columns` does of all."""
     with open_regular(path) as file:
-        header, line = _header(file, path)
-        layout = _layout(header, path, names)
-        table = _numbers(layout.with_commas(file.readline(MAX_LINE_BYTES)), layout, path, line)
-    return dict(zip(layout.used, table.T, strict=True))
+        layout, rows = _opened(file, path, names)
+        return dict(zip(layout.used, np.reshape(next(rows), (-1, 1)), strict=True))
 
 
 def _read(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
-    header, first_line = _header(file, path)
-    layout = _layout(header, path, names)
-    tables: list[FloatArray] = []
-    rows = 0
-    for block, line in _blocks(file, path, first_line):
-        if block.strip():
-            table = _numbers(layout.with_commas(block), layout, path, line)
-            rows += len(table)
-            require_samples(rows, str(path))
-            tables.append(table)
-    if not rows:
+    layout, rows = _opened(file, path, names)
+    values, count = array("d"), 0
+    for count, row in enumerate(rows, start=1):
+        require_samples(count, str(path))
+        values.extend(row)
+    if not count:
         raise RecordingError(f"{path}: expected samples below the header, got none")
-    columns: dict[str, FloatArray] = {}
-    for k, name in enumerate(layout.used):
-        columns[name] = np.concatenate([table[:, k] for table in tables])
-    ignored = tuple(name for name in layout.names if name not in columns)
-    return columns, ignored
+    table = np.frombuffer(values).reshape(count, -1)
+    columns = {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(layout.used)}
+    return columns, tuple(name for name in layout.names if name not in columns)
 
 
 class _Layout(NamedTuple):
@@ -89,13 +79,14 @@ class _Layout(NamedTuple):
     names: tuple[str, ...]  # of all of them
     used: tuple[str, ...]  # of those that are read
     places: tuple[int, ...]  # their indices
-    separator: bytes  # between columns
+    separator: str  # between columns
 
-    def with_commas(self, block: bytes) -> bytes:
-        """Return the lines with commas between their columns and points in their numbers."""
-        if self.separator != b",":
-            block = block.replace(b",", b".").replace(self.separator, b",")
-        return block.replace(b"\r\n", b"\n")
+
+def _opened(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[_Layout, Iterator[list[float]]]:
+    """The layout of a file, and its rows."""
+    header, line = _header(file, path)
+    layout = _layout(header, path, names)
+    return layout, _rows(file, layout, path, line)
 
 
 def _header(file: IO[bytes], path: Path) -> tuple[str, int]:
@@ -131,54 +122,47 @@ def _layout(header: str, path: Path, wanted: ColumnMap) -> _Layout:
     twice = {name for name in names if name and names.count(name) > 1}
     if twice:
         raise RecordingError(f"{path}: column {min(twice)} appears twice")
-    return _Layout(names, used, tuple(map(names.index, used)), separator.encode())
+    return _Layout(names, used, tuple(map(names.index, used)), separator)
 
 
-def _blocks(file: IO[bytes], path: Path, line: int) -> Iterator[tuple[bytes, int]]:
-    """Blocks of whole lines with the number of the first; text after the last line end is omitted."""
-    rest, padding = b"", False
-    while data := file.read(_BLOCK):
-        if not data.strip(b"\0"):
-            padding = True  # padding after a power loss
-            continue
-        end = data.rfind(b"\n") + 1
-        if padding or (not end and len(rest) + len(data) > MAX_LINE_BYTES):
-            raise RecordingError(f"{path}: line {line}: expected at most {MAX_LINE_BYTES >> 10} KiB")
-        if end:
-            yield rest + data[:end], line
-            line += data.count(b"\n")
-            rest = data[end:]
-        else:
-            rest += data
-    if rest.strip(b" \t\r\0"):
-        _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
-
-
-def _numbers(block: bytes, layout: _Layout, path: Path, first_line: int) -> FloatArray:
-    """(rows, used columns) numbers of some lines."""
-    lines = (line.partition("#")[0] for line in io.StringIO(block.decode("utf-8", errors="replace")))
-    reader, table = csv.reader(lines), []
+def _rows(file: IO[bytes], layout: _Layout, path: Path, first_line: int) -> Iterator[list[float]]:
+    """The numbers of each row, of the columns that are read."""
+    reader = csv.reader(_lines(file, path, first_line), delimiter=layout.separator)
     try:
         for cells in reader:
             if len(cells) == len(layout.names):
-                table.append(_row(cells, layout))
+                yield _row(cells, layout)
             elif "".join(cells).strip():
                 raise ValueError(f"expected {len(layout.names)} columns, got {len(cells)}")
     except (csv.Error, ValueError) as error:
         raise RecordingError(f"{path}: line {first_line + reader.line_num - 1}: {error}") from error
-    return np.array(table, dtype=np.float64).reshape(-1, len(layout.places))
+
+
+def _lines(file: IO[bytes], path: Path, number: int) -> Iterator[str]:
+    """The lines from a number on, without comments; text after the last line end is omitted."""
+    padded = False  # after a power loss
+    while line := file.readline(MAX_LINE_BYTES + 1):
+        if not line.strip(b"\0"):
+            padded = True
+        elif padded or len(line) > MAX_LINE_BYTES:
+            raise RecordingError(f"{path}: line {number}: expected at most {MAX_LINE_BYTES >> 10} KiB")
+        elif line.endswith(b"\n"):
+            number += 1
+            yield line.decode("utf-8", errors="replace").partition("#")[0]
+        elif line.strip(b" \t\r\0"):
+            _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
 
 
 def _row(cells: list[str], layout: _Layout) -> list[float]:
     try:
         return [float(cells[place]) for place in layout.places]
-    except ValueError:  # an empty cell, or a word
+    except ValueError:  # an empty cell, a decimal comma, or a word
         return [_number(cells[k].strip(), name) for k, name in zip(layout.places, layout.used, strict=True)]
 
 
 def _number(cell: str, name: str) -> float:
     try:
-        return math.nan if cell.lower() in _EMPTY else float(cell)
+        return math.nan if cell.lower() in _EMPTY else float(cell.replace(",", "."))
     except ValueError:
         raise ValueError(f"{name}: expected a number, got {cell[:40]!r}") from None
 

@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -89,27 +90,18 @@ class Day:
 
 def rows(folder: Path, joint: str) -> FloatArray:
     """Return the (n, 6) rows of a joint's last day, oldest first; a damaged line is left out."""
-    found: list[FloatArray] = []
+    found: list[list[float]] = []
     for path in reversed(day_files(folder, joint)):
         try:
             text = read_regular(path, _MOST).decode("ascii", "replace")
         except OSError:
             continue
-        lines = [line for line in text.splitlines()[1:] if line.count(",") == len(COLUMNS) - 1]
-        try:
-            found.append(np.loadtxt(lines, delimiter=",", ndmin=2).reshape(-1, len(COLUMNS)))
-        except ValueError:  # a damaged line
-            found += [one for line in lines if (one := _numbers(line)) is not None]
-    table = np.concatenate([np.zeros((0, len(COLUMNS))), *found])
+        for line in text.splitlines()[1:]:
+            with suppress(ValueError):  # a damaged line
+                row = [float(value) for value in line.split(",")]
+                found += [row] if len(row) == len(COLUMNS) else []
+    table = np.reshape(np.array(found, dtype=np.float64), (-1, len(COLUMNS)))
     return np.asarray(table[table[:, 0] > (table[-1, 0] if len(table) else 0.0) - DAY_S])
-
-
-def _numbers(line: str) -> FloatArray | None:
-    """One row; None: it is damaged."""
-    try:
-        return np.array([[float(value) for value in line.split(",")]])
-    except ValueError:
-        return None
 
 
 def thinned(table: FloatArray, begin_s: float, end_s: float, most: int) -> list[list[float | None]]:

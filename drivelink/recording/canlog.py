@@ -19,12 +19,12 @@ import can
 from drivelink.errors import RecordingError
 from drivelink.files import open_regular
 from drivelink.recording.limits import (
-    MAX_LINE_BYTES,
     AscText,
     BlfBytes,
     most_records,
     require_stamp,
     too_many_records,
+    whole_lines,
 )
 
 _LOG = logging.getLogger("drivelink.recording")
@@ -173,12 +173,7 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
     parsers: list[_Parser] = [_compact, _spaced]  # first that of the line before
     understood = strange = 0  # lines that are frames, also omitted ones, and others
     first_strange = ""
-    for number, line in enumerate(iter(lambda: file.readline(MAX_LINE_BYTES + 1), b""), start=1):
-        if not line.endswith(b"\n"):
-            if len(line) > MAX_LINE_BYTES:
-                raise RecordingError(f"{path}: expected lines of at most {MAX_LINE_BYTES >> 10} KiB")
-            _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
-            break
+    for number, line in enumerate(whole_lines(file, path), start=1):
         if line.isspace() or line.lstrip().startswith((b"#", b";")):
             continue
         try:

@@ -21,7 +21,7 @@ from drivelink.jointfile import JointFile
 from drivelink.jointfile.columns import COLUMNS
 from drivelink.recording.canlog import CAN_FORMATS
 from drivelink.recording.columns import ColumnMap
-from drivelink.recording.limits import MAX_COLUMNS, MAX_LINE_BYTES, require_samples
+from drivelink.recording.limits import MAX_COLUMNS, require_samples, whole_lines
 from drivelink.recording.sinks import CanSink, CsvSink, McapSink, Sink
 from estimator.sample import FloatArray
 
@@ -91,19 +91,14 @@ def _opened(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[_Layout, Ite
 
 def _header(file: IO[bytes], path: Path) -> tuple[str, int]:
     """Header line, and the number of the line after it."""
-    number = 0
-    while line := file.readline(MAX_LINE_BYTES + 1):
-        if not number:
-            if line.startswith((b"\xff\xfe", b"\xfe\xff")):
-                raise RecordingError(f"{path}: expected UTF-8 text, got UTF-16 (save it as plain CSV)")
-            line = line.removeprefix(b"\xef\xbb\xbf")
-        number += 1
-        if len(line) > MAX_LINE_BYTES:
-            raise RecordingError(f"{path}: line {number}: expected at most {MAX_LINE_BYTES >> 10} KiB")
-        if line.strip() and not line.lstrip().startswith(b"#"):
+    for number, line in enumerate(whole_lines(file, path), start=1):
+        if number == 1 and line.startswith((b"\xff\xfe", b"\xfe\xff")):
+            raise RecordingError(f"{path}: expected UTF-8 text, got UTF-16 (save it as plain CSV)")
+        text = line.removeprefix(b"\xef\xbb\xbf").strip()
+        if text and not text.startswith(b"#"):
             if b"\0" in line:
                 break
-            return line.decode("utf-8", errors="replace").strip(), number + 1
+            return text.decode("utf-8", errors="replace"), number + 1
     raise RecordingError(f"{path}: expected a CSV file with a line of column names, got no text")
 
 
@@ -127,7 +122,8 @@ def _layout(header: str, path: Path, wanted: ColumnMap) -> _Layout:
 
 def _rows(file: IO[bytes], layout: _Layout, path: Path, first_line: int) -> Iterator[list[float]]:
     """The numbers of each row, of the columns that are read."""
-    reader = csv.reader(_lines(file, path, first_line), delimiter=layout.separator)
+    lines = (line.decode(errors="replace").partition("#")[0] for line in whole_lines(file, path, first_line))
+    reader = csv.reader(lines, delimiter=layout.separator)
     try:
         for cells in reader:
             if len(cells) == len(layout.names):
@@ -136,21 +132,6 @@ def _rows(file: IO[bytes], layout: _Layout, path: Path, first_line: int) -> Iter
                 raise ValueError(f"expected {len(layout.names)} columns, got {len(cells)}")
     except (csv.Error, ValueError) as error:
         raise RecordingError(f"{path}: line {first_line + reader.line_num - 1}: {error}") from error
-
-
-def _lines(file: IO[bytes], path: Path, number: int) -> Iterator[str]:
-    """The lines from a number on, without comments; text after the last line end is omitted."""
-    padded = False  # after a power loss
-    while line := file.readline(MAX_LINE_BYTES + 1):
-        if not line.strip(b"\0"):
-            padded = True
-        elif padded or len(line) > MAX_LINE_BYTES:
-            raise RecordingError(f"{path}: line {number}: expected at most {MAX_LINE_BYTES >> 10} KiB")
-        elif line.endswith(b"\n"):
-            number += 1
-            yield line.decode("utf-8", errors="replace").partition("#")[0]
-        elif line.strip(b" \t\r\0"):
-            _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
 
 
 def _row(cells: list[str], layout: _Layout) -> list[float]:

@@ -12,6 +12,7 @@ import logging
 import os
 import re
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
@@ -76,6 +77,25 @@ _EMPTY_FD = re.compile(
 _REMOTE = 0x10  # among these flags
 
 
+def whole_lines(file: IO[bytes], path: Path, number: int = 1) -> Iterator[bytes]:
+    """Yield the lines of a text from a number on, without a last one that has no end, and padding after it.
+
+    Raises:
+        RecordingError: a line is too long.
+    """
+    padded = False  # after a power loss
+    while line := file.readline(MAX_LINE_BYTES + 1):
+        if not line.strip(b"\0"):
+            padded = True
+        elif padded or len(line) > MAX_LINE_BYTES:
+            raise RecordingError(f"{path}: line {number}: expected at most {MAX_LINE_BYTES >> 10} KiB")
+        elif line.endswith(b"\n"):
+            number += 1
+            yield line
+        elif line.strip(b" \t\r\0"):
+            _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
+
+
 class BlfBytes(io.BufferedIOBase):
     """The bytes of a BLF file, its containers unpacked within limits."""
 
@@ -116,8 +136,7 @@ class AscText(io.TextIOBase):
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         super().__init__()
-        self._file, self._path = file, path
-        self._number = 0
+        self._lines = whole_lines(file, path)
         self._relative = False
         self._total = 0.0
 
@@ -127,17 +146,8 @@ class AscText(io.TextIOBase):
         Raises:
             RecordingError: it is too long.
         """
-        line = self._file.readline(MAX_LINE_BYTES + 1)
-        self._number += 1
-        if len(line) > MAX_LINE_BYTES:
-            raise RecordingError(
-                f"{self._path}: line {self._number}: expected at most {MAX_LINE_BYTES >> 10} KiB"
-            )
-        if not line.endswith(b"\n"):
-            if line.strip():
-                _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", self._path)
-            return ""
-        return self._known(line.decode(errors="replace"))
+        line = next(self._lines, None)
+        return "" if line is None else self._known(line.decode(errors="replace"))
 
     def _known(self, line: str) -> str:
         if _RELATIVE.match(line):

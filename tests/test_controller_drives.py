@@ -137,18 +137,6 @@ def test_a_fault_ends_the_torque_and_is_reset_by_edges_and_not_for_ever():
         assert 1 <= edges <= drives.MOST_RESETS
 
 
-def test_a_reboot_is_noticed_and_everything_done_again():
-    with bench() as b:
-        b.run(100, 0.02)
-        b.drive.reset_node()
-        b.run(2)
-        assert not b.master.states["enabled"]
-        b.put(0x000, b"\x01\x05")
-        b.run(1200, 0.02)
-        assert b.master.states["enabled"]
-        assert b.number(0x6071) == -100
-
-
 def test_a_drive_that_does_not_answer_is_one_line(capsys):
     with bench() as b:
         b.network.plugged = False

@@ -48,9 +48,18 @@ def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray
     """
     try:
         with open_regular(path) as file:
-            return _read(file, path, names)
+            layout, rows = _opened(file, path, names)
+            values, count = array("d"), 0
+            for count, row in enumerate(rows, start=1):
+                require_samples(count, str(path))
+                values.extend(row)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    if not count:
+        raise RecordingError(f"{path}: expected samples below the header, got none")
+    table = np.frombuffer(values).reshape(count, -1)
+    columns = {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(layout.used)}
+    return columns, tuple(name for name in layout.names if name not in columns)
 
 
 def first_row(path: Path, names: ColumnMap) -> dict[str, FloatArray]:
@@ -58,19 +67,6 @@ def first_row(path: Path, names: ColumnMap) -> dict[str, FloatArray]:
     with open_regular(path) as file:
         layout, rows = _opened(file, path, names)
         return dict(zip(layout.used, np.reshape(next(rows), (-1, 1)), strict=True))
-
-
-def _read(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
-    layout, rows = _opened(file, path, names)
-    values, count = array("d"), 0
-    for count, row in enumerate(rows, start=1):
-        require_samples(count, str(path))
-        values.extend(row)
-    if not count:
-        raise RecordingError(f"{path}: expected samples below the header, got none")
-    table = np.frombuffer(values).reshape(count, -1)
-    columns = {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(layout.used)}
-    return columns, tuple(name for name in layout.names if name not in columns)
 
 
 class _Layout(NamedTuple):

@@ -4,7 +4,6 @@ import itertools
 import json
 import math
 import signal
-import threading
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from zenohkit import (
     make_sample,
     put_estimate,
     ready,
+    repeated,
     script,
     until,
 )
@@ -91,17 +91,8 @@ def test_a_new_subscriber_gets_the_last_status_and_model_at_once(publisher, clie
 @pytest.fixture
 def answering(publisher):
     """Answers as the daemon's housekeeping does."""
-    over = threading.Event()
-
-    def answer():
-        while not over.wait(0.05):
-            publisher.answer()
-
-    thread = threading.Thread(target=answer)
-    thread.start()
-    yield
-    over.set()
-    thread.join()
+    with repeated(publisher.answer, 0.05):
+        yield
 
 
 def test_a_flood_of_queries_waits_for_the_slack_and_most_of_it_is_dropped(publisher, client):

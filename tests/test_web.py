@@ -2,7 +2,6 @@
 
 import json
 import socket
-import threading
 import urllib.error
 import urllib.request
 
@@ -41,17 +40,8 @@ def web(daemon):
 @pytest.fixture
 def polling(web):
     """The page is fed meanwhile."""
-    over = threading.Event()
-
-    def poll():
-        while not over.wait(0.02):
-            web.poll()
-
-    poller = threading.Thread(target=poll)
-    poller.start()
-    yield
-    over.set()
-    poller.join()
+    with zenohkit.repeated(web.poll, 0.02):
+        yield
 
 
 def test_the_page_loads_nothing_from_elsewhere_and_answers_this_machine_only(web):

@@ -4,8 +4,9 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -121,6 +122,24 @@ def python(*arguments: str | Path, **environment: str) -> Iterator[subprocess.Po
 def script(*arguments: str, name: str = "zenoh_daemon.py") -> AbstractContextManager[subprocess.Popen[str]]:
     """A Python process of the test."""
     return python(HERE / name, *arguments)
+
+
+@contextmanager
+def repeated(call: Callable[[], object], every_s: float) -> Iterator[None]:
+    """Something is called all the time in a thread, as a loop's slack would."""
+    over = threading.Event()
+
+    def repeat() -> None:
+        while not over.wait(every_s):
+            call()
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def connected(publisher, joint) -> None:

@@ -34,8 +34,7 @@ def examine(joint: JointFile | None, base_dir: Path, seconds: float) -> Report:
         return report
     examine_interface(section, joint.bus)
     zenoh = Section("Zenoh")
-    examine_zenoh(zenoh, joint, base_dir)
-    examine_bus(report, joint, base_dir, seconds, alive=zenoh.facts.get("alive", ()))
+    examine_bus(report, joint, base_dir, seconds, examine_zenoh(zenoh, joint, base_dir))
     report.sections.append(zenoh)
     return report
 

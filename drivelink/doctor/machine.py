@@ -196,26 +196,30 @@ def _judge_producer(section: Section, text: str, daemons: Daemons) -> None:
         )
 
 
-def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> None:
-    """Check who listens at the endpoint, which daemons are alive, and whether this joint's key is taken."""
+def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> list[str]:
+    """Check who listens at the endpoint, and whether this joint's key is taken.
+
+    Returns:
+        The joints that are served there.
+    """
     settings = joint.zenoh
     config = base_dir / settings.config if settings.config is not None else None
     if config is not None and not config.is_file():
         section.error("zenoh", f"{settings.config}: there is no such file", "correct zenoh.config")
-        return
+        return []
     where = settings.config or settings.endpoint
     if config is None and not answers(settings.endpoint):
         section.ok("zenoh", f"{where}: nobody there yet, the daemon will listen there")
-        return
+        return []
     try:
         names = joints(endpoint=settings.endpoint, config=config, prefix=settings.prefix)
     except ZenohError as error:
         section.error("zenoh", str(error))
-        return
+        return []
     section.facts["alive"] = [f"{settings.prefix}/{name}/alive" for name in names]
     if not names:
         section.ok("zenoh", f"{where}: reachable, no daemon is alive there")
-        return
+        return []
     section.ok("zenoh", f"{where}: reachable, alive: {', '.join(names)}")
     if joint.name in names:
         section.info(
@@ -223,3 +227,4 @@ def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> None:
             f'a daemon for "{joint.name}" runs: a second one would be refused',
             f"drivelink monitor {joint.name}",
         )
+    return names

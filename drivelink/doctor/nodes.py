@@ -43,17 +43,16 @@ from drivelink.notice import Severity
 
 
 def examine_bus(
-    report: Report, joint: JointFile, base_dir: Path, seconds: float, alive: Sequence[str] = ()
+    report: Report, joint: JointFile, base_dir: Path, seconds: float, served: Sequence[str] = ()
 ) -> None:
     """Run all checks that need an open bus. Reads only; listens only if the joint file is passive.
 
     Args:
         report: receives a section for the bus and one per node.
-        alive: liveliness keys of running daemons, one of which may produce SYNC.
+        served: joints of running daemons, one of which may produce SYNC.
     """
     section = report.section("Bus")
-    names = [key.split("/")[-2] for key in alive]
-    daemons = Daemons(ours=joint.name in names, others=[name for name in names if name != joint.name])
+    daemons = Daemons(ours=joint.name in served, others=[name for name in served if name != joint.name])
     try:
         bus = open_bus(joint.bus)
     except BusError as error:

@@ -165,7 +165,9 @@ def test_a_file_that_makes_the_estimator_worse_is_not_written(healthy):
 
     def surely(share: float) -> JointModel:
         own = Transmission(
-            model="linear", parameters={"k_nm_rad": share * kit.STIFFNESS}, covariance=((1.0,),)
+            model="linear",
+            parameters={"k_nm_rad": share * kit.STIFFNESS},
+            covariance=((0.01,),),  # data do not move it
         )
         return replace(model, motors=(replace(model.motors[0], transmission=own),))
 

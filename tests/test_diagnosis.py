@@ -244,6 +244,8 @@ def test_gaps_are_left_out(records):
         (0.2, 0.0, "asymmetric_friction"),
         (np.resize([0.3, -0.2], 10), 0.0, "coulomb_friction"),  # a gain within its standard error is none
         (0.2, np.resize([2.3, -1.7], 10), "asymmetric_friction"),  # the best is not sure over either
+        # one that scores less than one that is ruled out is out as well
+        (np.resize([5.2, -4.8], 10), np.resize([5.3, -4.7], 10), "presliding_friction"),
     ],
 )
 def test_the_simplest_within_one_standard_error_is_chosen(gain, best, chosen, monkeypatch):
@@ -265,7 +267,8 @@ def test_the_simplest_within_one_standard_error_is_chosen(gain, best, chosen, mo
         one.families, one.parameters = frozenset(families), parameters
     found = held.simplest([simple, other, third])
     assert found.name == chosen
-    assert held.weights([found, other if found is simple else simple], found)[0] > 0.9
+    if found is not third:
+        assert held.weights([found, other if found is simple else simple], found)[0] > 0.9
 
 
 def test_friction_is_named_where_the_declared_spring_carries_nothing():

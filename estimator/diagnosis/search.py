@@ -165,8 +165,7 @@ class Search:
         while True:
             found = self.held.simplest(self.seen)
             if found in tried:
-                better = np.mean(self.held.scores(found)) > np.mean(self.held.scores(self.null))
-                return found if better else self.null
+                return found
             if found in settled:
                 tried.add(found)
                 beside = self._beside(found)

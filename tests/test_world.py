@@ -8,7 +8,7 @@ import joints
 import numpy as np
 import pytest
 
-from estimator import JointModel, Motor, Record, Transmission
+from estimator import EstimatorSettings, JointModel, Motor, Record, Status, Transmission, make_estimator
 from estimator.diagnosis import diagnose
 
 SOURCE = Path(__file__).parent.parent / "benchmarks" / "world.c"
@@ -32,6 +32,17 @@ def world(tmp_path_factory):
         return 0, dict(zip(lines[0].split(","), rows, strict=True)), done.stderr
 
     return run
+
+
+def recorded(c) -> Record:
+    """What a drive and an encoder read."""
+    return Record(
+        period_s=1e-3,
+        sequence=np.arange(len(c["time_s"])),
+        motor_position_rad=c["motor1_position_rad"][:, None],
+        motor_torque_nm=c["motor1_torque_nm"][:, None],
+        link_position_rad=c["link_position_rad"],
+    )
 
 
 EXACT = ("motor_counts=0", "link_bits=0", "seconds=3")
@@ -120,16 +131,30 @@ def test_a_hand_that_moves_a_healthy_joint_shows_no_other_inertia(world):
         "link_inertia=0.89 link_damping=0.058 gravity=0 link_delay=0.0007 motor_counts=65536 link_bits=18"
     )
     _, c, _ = world(*settings.split())
-    record = Record(
-        period_s=1e-3,
-        sequence=np.arange(len(c["time_s"])),
-        motor_position_rad=c["motor1_position_rad"][:, None],
-        motor_torque_nm=c["motor1_torque_nm"][:, None],
-        link_position_rad=c["link_position_rad"],
-    )
+    record = recorded(c)
     motor = Motor(
         inertia_kg_m2=0.2483, viscous_damping_nm_s_rad=0.93, inertia_std_relative=1e-4,
         transmission=Transmission(model="linear", parameters={"k_nm_rad": 124.45}),
     )  # fmt: skip
     found = diagnose(record, JointModel(arrangement="single", motors=(motor,)))
     assert found.verdict == "sufficient", found.effects
+
+
+def test_the_interval_holds_what_the_shape_of_an_undeclared_effect_may_be_off(world):
+    """A gear's losses are nearly, not quite, of the shape that the estimator has for them."""
+    settings = "spring=cubic stiffness=120 cubic=3600 gear_loss=0.05 seconds=20 size=7.2 link_bits=18"
+    _, c, _ = world(*settings.split())
+    motor = Motor(
+        inertia_kg_m2=0.12,
+        viscous_damping_nm_s_rad=0.8,
+        transmission=Transmission(model="polynomial", order=2),
+    )
+    estimator = make_estimator(JointModel(arrangement="single", motors=(motor,)), EstimatorSettings(), 1e-3)
+    said = [
+        (one.stiffness_nm_rad, one.stiffness_std_nm_rad, int(one.status) & Status.VALID > 0)
+        for one in map(estimator.step, recorded(c).samples())
+    ]
+    stiffness, std, valid = np.array(said).T
+    off = np.abs(stiffness - c["true_stiffness_nm_rad"])[valid > 0]
+    assert "load_dependent_friction" in estimator.undeclared()[0] and np.mean(valid) > 0.8
+    assert np.mean(off < 1.96 * std[valid > 0]) > 0.95

@@ -14,6 +14,7 @@ const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the
 const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
 const EXACT: f64 = 3e-4; // of the torque: what filters, sampling and rounding leave of a true model
 const ALIKE: f64 = 0.3; // share of what a missing effect does to a block that it does to all: 0 is noise, 1 one motion again and again
+const UNLIKE: f64 = 0.05; // of friction and memory that nobody declared: no joint's are quite of our shapes
 const UNLIKELY: f64 = 0.05; // probability that an interval of 95 % need not hold
 const ACCUSED: f64 = 1000.0; // odds at which the declared zero is called wrong
 
@@ -301,7 +302,8 @@ impl Blocks {
         self.score(frame, &residual, chosen.set);
         // What no noise explains is an effect that is missing: what it does to a block is in the blocks' scores, what it
         // does to all of them alike is not.
-        let missing = (own - self.white - (EXACT * total.rms(balance::TORQUE)).powi(2)).max(0.0);
+        let (rounded, unlike) = (EXACT * total.rms(balance::TORQUE), UNLIKE * self.friction);
+        let missing = (own - self.white - rounded * rounded).max(0.0) + unlike * unlike;
         let by_prior = by_prior(chosen, prior);
         let blocks = self.ring.len() as f64;
         let clustered =

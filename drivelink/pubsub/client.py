@@ -23,19 +23,30 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, Self
 
 import zenoh
 
 from drivelink.pubsub.clientbase import PATIENCE_S, Client
 from drivelink.pubsub.feed import WAKE
-from drivelink.pubsub.session import ENDPOINT
 from drivelink.pubsub.wire import EstimateMessage
 
 
 class Subscription(Client):
-    """Estimates of one joint; see `subscribe`."""
+    """Subscribe to the estimates of a joint; the daemon may come later, go, and come back.
+
+    Args:
+        joint: its name, as in the joint file.
+        endpoint: where a daemon or a router listens.
+        config: a zenoh configuration file (JSON5) instead of the endpoint: TLS, access control, scouting.
+        prefix: first part of every key, as in the joint file.
+        session: an open session to use instead; it stays open.
+        depth: estimates kept unread before the oldest is dropped.
+        stale_after_s: age from which an estimate is stale; None: five periods, at least 20 ms.
+
+    Raises:
+        ZenohError: no session can be opened, or a name cannot be part of a key.
+    """
 
     def wait(self, timeout_s: float | None = None) -> EstimateMessage | None:
         """Return the newest unread estimate; wait for one if there is none.
@@ -160,43 +171,12 @@ class _Alarm:
                 self._changed.wait(None if self._wakes_s == math.inf else max(0.0, self._wakes_s - now_s))
 
 
-def subscribe(
-    joint: str,
-    *,
-    endpoint: str = ENDPOINT,
-    config: str | Path | None = None,
-    prefix: str = "drivelink",
-    session: zenoh.Session | None = None,
-    depth: int = 1024,
-    stale_after_s: float | None = None,
-) -> Subscription:
-    """Subscribe to the estimates of a joint; the daemon may come later, go, and come back.
-
-    Args:
-        joint: its name, as in the joint file.
-        endpoint: where a daemon or a router listens.
-        config: a zenoh configuration file (JSON5) instead of the endpoint: TLS, access control, scouting.
-        prefix: first part of every key, as in the joint file.
-        session: an open session to use instead; it stays open.
-        depth: estimates kept unread before the oldest is dropped.
-        stale_after_s: age from which an estimate is stale; None: five periods, at least 20 ms.
+class AsyncSubscription(Client):
+    """Subscribe as `Subscription` does, for asyncio: made in a running loop.
 
     Raises:
         ZenohError: no session can be opened, or a name cannot be part of a key.
     """
-    return Subscription(
-        joint,
-        endpoint=endpoint,
-        config=config,
-        prefix=prefix,
-        session=session,
-        depth=depth,
-        stale_after_s=stale_after_s,
-    )
-
-
-class AsyncSubscription(Client):
-    """Estimates of one joint for asyncio; see `subscribe_async`."""
 
     async def wait(self, timeout_s: float | None = None) -> EstimateMessage | None:
         """Return the next cycle: the newest estimate that was not read yet, or None when the time is over."""
@@ -257,27 +237,4 @@ class AsyncSubscription(Client):
         return None
 
 
-def subscribe_async(
-    joint: str,
-    *,
-    endpoint: str = ENDPOINT,
-    config: str | Path | None = None,
-    prefix: str = "drivelink",
-    session: zenoh.Session | None = None,
-    depth: int = 1024,
-    stale_after_s: float | None = None,
-) -> AsyncSubscription:
-    """Return the same as `subscribe` for asyncio, to be called in a running loop.
-
-    Raises:
-        ZenohError: no session can be opened, or a name cannot be part of a key.
-    """
-    return AsyncSubscription(
-        joint,
-        endpoint=endpoint,
-        config=config,
-        prefix=prefix,
-        session=session,
-        depth=depth,
-        stale_after_s=stale_after_s,
-    )
+subscribe, subscribe_async = Subscription, AsyncSubscription

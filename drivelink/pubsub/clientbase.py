@@ -95,12 +95,12 @@ class Client:
         self,
         joint: str,
         *,
-        endpoint: str,
-        config: str | Path | None,
-        prefix: str,
-        session: zenoh.Session | None,
-        depth: int,
-        stale_after_s: float | None,
+        endpoint: str = ENDPOINT,
+        config: str | Path | None = None,
+        prefix: str = "drivelink",
+        session: zenoh.Session | None = None,
+        depth: int = 1024,
+        stale_after_s: float | None = None,
     ) -> None:
         for what, text in (("joint", joint), ("prefix", prefix)):
             if not _NAME.fullmatch(text):

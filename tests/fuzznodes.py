@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from simkit import Readings, StubRig
+from simkit import StubRig
 
 from sim.canopen.drive import Cia402Drive
-from sim.canopen.encoder import Cia406Encoder, EncoderData
+from sim.canopen.encoder import Cia406Encoder
 from sim.canopen.profiles import profile
+from sim.sensors import DriveSignals, LinkEncoder
 
 NO_RTR = 1 << 30
 _TRAP = {  # default TPDO1 of node 1: identifier and length of ours, at every SYNC, and it means else
@@ -22,16 +23,14 @@ class FuzzNode:
 
     def __init__(self, node: int) -> None:
         self.node = node
-        self._rig = rig = StubRig()
-        rig.drive = lambda _motor: Readings(3 * rig.tick + 1000 * node, 1e9, 0.5, 1e-3 * (rig.tick % 30))
+        self._rig = rig = StubRig(encoder=LinkEncoder(counts_per_rev=65536))
+        rig.drive = lambda _motor: DriveSignals(3 * rig.tick + 1000 * node, 1e9, 0.5, 1e-3 * (rig.tick % 30))
         rig.link_counts = lambda: 5 * rig.tick + 7
         quirks = replace(profile("strict"), self_starting=node != 2)
         if node == 3:
-            self.device = Cia406Encoder(
-                3, rig, EncoderData(counts_per_rev=65536, range_counts=1 << 24), quirks
-            )
+            self.device = Cia406Encoder(3, rig, quirks, range_counts=1 << 24)
         else:
-            self.device = Cia402Drive(node, rig, node - 1, quirks=quirks)
+            self.device = Cia402Drive(node, rig, node - 1, quirks)
         for address, value in _TRAP.items() if node == 1 else ():
             self.device.dictionary.find(*address).default = value
         self._sent: list[tuple[int, bytes]] = []

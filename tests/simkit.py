@@ -6,32 +6,34 @@ import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 import can
 
 from sim.canopen.node import Node
 from sim.network import Network
+from sim.sensors import DriveHardware, DriveSignals, LinkEncoder
 
 TRANSCRIPTS = Path(__file__).parent / "transcripts"
 _channels = itertools.count()
 
 
-class Readings(NamedTuple):
-    position_counts: int
-    velocity_rad_s: float
-    current_a: float
-    torque_nm: float
-
-
 class StubRig:
-    """Position 100 counts further each period, link 7; 0.5 A and 0.05 N·m; pi rad/s, which is 30 rpm."""
+    """Position 100 counts further each period, link 7; 0.5 A and 0.05 N·m; pi rad/s, which is 30 rpm.
+
+    Args:
+        drive: of each of its two motors.
+    """
 
     period_s = 0.001
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        drive: DriveHardware = DriveHardware(),
+        encoder: LinkEncoder = LinkEncoder(),  # noqa: B008
+    ) -> None:
         self.tick, self.commands = 0, []
-        self.drive = lambda _motor: Readings(100 * self.tick, 3.14159265358979, 0.5, 0.05)
+        self.drives, self.encoder = (drive, drive), encoder
+        self.drive = lambda _motor: DriveSignals(100 * self.tick, 3.14159265358979, 0.5, 0.05)
         self.link_counts = lambda: 7 * self.tick
         self.command = lambda _motor, torque_nm: self.commands.append(torque_nm)
 

@@ -10,9 +10,10 @@ import drives
 from simkit import StubRig
 
 from drivelink import jointfile
-from sim.canopen.drive import Cia402Drive, DriveData
+from sim.canopen.drive import Cia402Drive
 from sim.canopen.profiles import profile
 from sim.network import Network
+from sim.sensors import DriveHardware
 
 RATED_MNM = 10  # so one per mille is 0.2 mN·m at the joint
 JOINT = """
@@ -36,7 +37,9 @@ class Bench:
         self.now_s = 0.0
         self.sent: list[tuple[int, bytes]] = []
         self.buses = [can.Bus(interface="virtual", channel=f"drives-{id(self)}") for _ in range(2)]
-        self.drive = Cia402Drive(5, StubRig(), 0, DriveData(rated_torque_mnm=RATED_MNM), profile(quirks))
+        self.drive = Cia402Drive(
+            5, StubRig(DriveHardware(torque_constant_nm_a=RATED_MNM / 2000)), 0, profile(quirks)
+        )
         self.network = Network(self.buses[0], [self.drive], StubRig(), clock=lambda: self.now_s)
         self.canopen = canopen.Network(self)
         self.master = self.made()

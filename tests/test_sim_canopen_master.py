@@ -13,11 +13,12 @@ from canopen.sdo.exceptions import SdoAbortedError
 from simkit import StubRig
 
 from drivelink.canopen.bus import interface_is_up
-from sim.canopen.drive import Cia402Drive, DriveData
+from sim.canopen.drive import Cia402Drive
 from sim.canopen.edsfile import eds_directory, node_eds
-from sim.canopen.encoder import Cia406Encoder, EncoderData
+from sim.canopen.encoder import Cia406Encoder
 from sim.canopen.profiles import PROFILES, profile
 from sim.network import Network
+from sim.sensors import DriveHardware
 
 _channels = itertools.count()
 PATIENCE_S = 5.0  # only ever waited for when something is broken
@@ -55,7 +56,7 @@ def mastered(*nodes, rig, interface="virtual"):
 def device(eds, rig):
     """What an EDS file describes."""
     quirks = EDS[eds]
-    return Cia402Drive(1, rig, 0, quirks=profile(quirks)) if quirks else Cia406Encoder(1, rig, EncoderData())
+    return Cia402Drive(1, rig, 0, profile(quirks)) if quirks else Cia406Encoder(1, rig)
 
 
 def remote(master, eds="cia402-drive.eds"):
@@ -103,12 +104,12 @@ def test_every_object_of_the_eds_is_served_with_its_type_and_default(eds):
 
 
 def test_an_eds_file_has_the_nameplate_of_its_device():
-    data = DriveData(counts_per_rev=8192, gear=(50, 3), link_counts_per_rev=65536)
-    node = Cia402Drive(1, StubRig(), 0, data, replace(profile("epos4"), second_encoder=3))
+    rig = StubRig(DriveHardware(counts_per_rev=8192, gear_ratio=50 / 3))
+    node = Cia402Drive(1, rig, 0, replace(profile("epos4"), second_encoder=3), link_encoder=True)
     text = node_eds("elbow.eds", node)
     assert "FileName=elbow.eds" in text and "ProductName=drivelink simulated drive, EPOS4-like" in text
     assert "[60E4sub3]\nParameterName=Additional position actual value, sensor 3" in text
-    strict = node_eds("elbow.eds", Cia402Drive(1, StubRig(), 0, data))
+    strict = node_eds("elbow.eds", Cia402Drive(1, rig, 0))
     assert "[608Fsub1]" in strict and "DefaultValue=0x2000" in strict.split("[608Fsub1]")[1][:160]
 
 

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 import pytest
 from simkit import StubRig, wired
 
-from sim.canopen.drive import Cia402Drive, DriveData
+from sim.canopen.drive import Cia402Drive
 from sim.canopen.profiles import PROFILES, profile
 from sim.errors import SimError
 
@@ -15,7 +15,7 @@ NO_OBJECT, NO_SUBINDEX, READ_ONLY = 0x06020000, 0x06090011, 0x06010002
 @contextmanager
 def powered(name):
     rig = StubRig()
-    with wired(Cia402Drive(1, rig, 0, DriveData(link_counts_per_rev=262144), profile(name)), rig=rig) as wire:
+    with wired(Cia402Drive(1, rig, 0, profile(name), link_encoder=True), rig=rig) as wire:
         wire.booted = wire.power_on()
         yield wire
 

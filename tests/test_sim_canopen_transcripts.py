@@ -3,15 +3,16 @@
 import pytest
 from simkit import TRANSCRIPTS, StubRig, play, wired
 
-from sim.canopen.drive import Cia402Drive, DriveData
-from sim.canopen.encoder import Cia406Encoder, EncoderData
-from sim.canopen.profiles import profile
+from sim.canopen.drive import Cia402Drive
+from sim.canopen.encoder import Cia406Encoder
+from sim.sensors import LinkEncoder
 
 
 def device(name, rig):
     if name == "encoder":
-        return Cia406Encoder(1, rig, EncoderData(counts_per_rev=65536, range_counts=65536 * 4096))
-    return Cia402Drive(1, rig, 0, DriveData(link_counts_per_rev=262144), profile("strict"))
+        rig.encoder = LinkEncoder(counts_per_rev=65536)
+        return Cia406Encoder(1, rig, range_counts=65536 * 4096)
+    return Cia402Drive(1, rig, 0, link_encoder=True)
 
 
 @pytest.mark.parametrize("transcript", sorted(path.stem for path in TRANSCRIPTS.glob("*.txt")))

@@ -11,7 +11,6 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,8 @@ import can
 from drivelink.errors import JointFileError, UsageError
 from drivelink.jointfile import JointFile, MotorSection, SimSection
 from estimator.model import LinkDynamics
-from sim.canopen.drive import Cia402Drive, DriveData
-from sim.canopen.encoder import Cia406Encoder, EncoderData
+from sim.canopen.drive import Cia402Drive
+from sim.canopen.encoder import Cia406Encoder
 from sim.canopen.node import Node
 from sim.canopen.profiles import Quirks, profile
 from sim.cases import CASES, Case, case
@@ -264,11 +263,10 @@ def nodes_from_joint(
             raise JointFileError(
                 f"{file or joint.name}: motor[{index + 1}].drive: expected this table to simulate it"
             )
-        data = _drive_data(world, index, motor.drive.node_id == host)
-        nodes.append(Cia402Drive(motor.drive.node_id, world, index, data, own))
+        number = motor.drive.node_id
+        nodes.append(Cia402Drive(number, world, index, own, link_encoder=number == host))
     if encoder is not None and encoder.source == "cia406" and encoder.node_id is not None:
-        counts = EncoderData(counts_per_rev=round(world.encoder.counts_per_rev))
-        nodes.append(Cia406Encoder(encoder.node_id, world, counts))
+        nodes.append(Cia406Encoder(encoder.node_id, world))
     return tuple(nodes)
 
 
@@ -279,19 +277,6 @@ def _profile(joint: JointFile, quirks: str | None) -> Quirks:
         if quirks:
             raise UsageError(f"--{error}") from error
         raise JointFileError(f"{joint.name}: sim.{error}") from error
-
-
-def _drive_data(world: World, motor: int, has_link_encoder: bool) -> DriveData:
-    hardware = world.drives[motor]
-    gear = Fraction(hardware.gear_ratio).limit_denominator(1000)
-    return DriveData(
-        rated_current_ma=max(1, round(hardware.rated_current_a * 1e3)),
-        rated_torque_mnm=max(1, round(hardware.rated_torque_nm * 1e3)),
-        max_current_per_mille=round(1e3 * hardware.limit_a / hardware.rated_current_a),
-        counts_per_rev=round(hardware.counts_per_rev),
-        gear=(gear.numerator, gear.denominator),
-        link_counts_per_rev=round(world.encoder.counts_per_rev) if has_link_encoder else None,
-    )
 
 
 def network_from_joint(

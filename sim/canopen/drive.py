@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import dataclass
 from enum import IntEnum
+from fractions import Fraction
 
 from sim.canopen.dictionary import Abort, Entry, Object, SdoAbortedError, variables
 from sim.canopen.edsfile import load_eds, with_members, with_values
 from sim.canopen.node import Nmt, Node
 from sim.canopen.profiles import Quirks
-from sim.sensors import DriveSignals
+from sim.sensors import DriveHardware, DriveSignals
 from sim.world import World
 
 _FAULT_RESET = 0x80
@@ -109,42 +109,32 @@ _RADIAN, _DEGREE, _REVOLUTION, _INCREMENT = 0x10, 0x41, 0xB4, 0xB5
 _SECONDS = {0x03: 1.0, 0x47: 60.0}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DriveData:
-    """The nameplate of one drive with its motor, encoders and gear."""
-
-    rated_current_ma: int = 2000  # 0x6075
-    rated_torque_mnm: int = 100  # 0x6076, at the motor shaft
-    max_current_per_mille: int = 3000  # 0x6073
-    counts_per_rev: int = 4096  # 0x608F:1, per motor revolution
-    gear: tuple[int, int] = (1, 1)  # 0x6091: motor revolutions per shaft revolutions
-    link_counts_per_rev: int | None = None  # 0x60E6:1, of the second encoder; None: it is not wired
-
-    def values(self) -> dict[tuple[int, int], int]:
-        """Return power-on values, by (index, subindex)."""
-        motor, shaft = self.gear
-        return {
-            (0x6073, 0): self.max_current_per_mille,
-            (0x6075, 0): self.rated_current_ma,
-            (0x6076, 0): self.rated_torque_mnm,
-            (0x608F, 1): self.counts_per_rev,
-            (0x6091, 1): motor,
-            (0x6091, 2): shaft,
-            (0x6092, 1): self.counts_per_rev * motor // shaft,
-        }
+def _nameplate(drive: DriveHardware) -> dict[tuple[int, int], int]:
+    """Power-on values of a drive with its motor, encoder and gear, by (index, subindex)."""
+    gear = Fraction(drive.gear_ratio).limit_denominator(1000)
+    counts = round(drive.counts_per_rev)
+    return {
+        (0x6073, 0): round(1e3 * drive.limit_a / drive.rated_current_a),
+        (0x6075, 0): max(1, round(drive.rated_current_a * 1e3)),
+        (0x6076, 0): max(1, round(drive.rated_torque_nm * 1e3)),
+        (0x608F, 1): counts,
+        (0x6091, 1): gear.numerator,
+        (0x6091, 2): gear.denominator,
+        (0x6092, 1): counts * gear.numerator // gear.denominator,
+    }
 
 
-def _drive_objects(data: DriveData, quirks: Quirks) -> list[Object]:
-    """The dictionary of a drive, by its EDS file and nameplate."""
+def _drive_objects(plate: Mapping[tuple[int, int], int], link_counts: int, quirks: Quirks) -> list[Object]:
+    """The dictionary of a drive, by its EDS file and nameplate; `link_counts` 0: no second encoder."""
     second = quirks.second_encoder
     objects = [_with_sensors(one, second) if one.index in _SENSORS else one for one in load_eds(quirks.eds)]
     values: dict[tuple[int, int], int | str] = {
-        (0x60E6, second): data.link_counts_per_rev or 0,
+        (0x60E6, second): link_counts,
         (0x60EB, second): 1,
     }
     if quirks.identity is not None:
         values |= {(0x1008, 0): quirks.identity[0], (0x1018, 2): quirks.identity[1]}
-    return with_values(objects, {**data.values(), **values})
+    return with_values(objects, {**plate, **values})
 
 
 def _with_sensors(described: Object, count: int) -> Object:
@@ -162,25 +152,30 @@ def _limited(value: float, bound: int) -> int:
 
 
 class Cia402Drive(Node):
-    """One drive of a rig."""
+    """One drive of a rig.
+
+    Args:
+        link_encoder: whether the encoder at the link is wired to it.
+    """
 
     def __init__(
         self,
         node_id: int,
         rig: World,
         motor: int,
-        data: DriveData | None = None,
         quirks: Quirks | None = None,
+        *,
+        link_encoder: bool = False,
     ) -> None:
-        self._rig = rig
-        self._motor = motor
-        self.data = data or DriveData()
-        quirks = quirks or Quirks()
+        self._rig, self._motor, self._wired = rig, motor, link_encoder
+        quirks, plate = quirks or Quirks(), _nameplate(rig.drives[motor])
+        link_counts = round(rig.encoder.counts_per_rev) if link_encoder else 0
+        self._counts_per_rev = plate[0x608F, 1]
         self._sampled: tuple[Callable[[DriveSignals], None], ...] = ()
-        super().__init__(node_id, _drive_objects(self.data, quirks), quirks)
+        super().__init__(node_id, _drive_objects(plate, link_counts, quirks), quirks)
         self.machine = StateMachine()
-        self._torque_unit_nm = max(1, self.data.rated_torque_mnm) * 1e-6
-        self._current_unit_a = max(1, self.data.rated_current_ma) * 1e-6
+        self._torque_unit_nm = plate[0x6076, 0] * 1e-6
+        self._current_unit_a = plate[0x6075, 0] * 1e-6
         self._demand = 0.0  # per mille of rated torque
         self._following = self._limiting = self._reached = False
         self._toggle = 0
@@ -213,7 +208,7 @@ class Cia402Drive(Node):
             (self._read_torque, frozenset({self._torque})),
             (self._read_current, frozenset({self._current, self._milliampere})),
         ]
-        if self.data.link_counts_per_rev is not None:
+        if self._wired:
             self._sensors.append((self._read_link, frozenset({self._link, self._link_velocity})))
         self._control.changed = self._obey
         self._mode.check = self._check_mode
@@ -239,7 +234,7 @@ class Cia402Drive(Node):
             _RADIAN: 1.0,
             _DEGREE: 360.0 / turn,
             _REVOLUTION: 1.0 / turn,
-            _INCREMENT: self.data.counts_per_rev / turn,
+            _INCREMENT: self._counts_per_rev / turn,
         }
         exponent = (word >> 24) - (256 if word >> 31 else 0)
         if exponent not in self.quirks.velocity_exponents:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from sim.canopen.dictionary import Abort, SdoAbortedError
 from sim.canopen.edsfile import load_eds, with_values
@@ -16,35 +16,28 @@ _FASTEST = 0x7FFF
 _OPERATING_BITS = SCALING | REVERSED
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EncoderData:
-    """The nameplate of an encoder."""
-
-    counts_per_rev: int = 262144  # 0x6501
-    range_counts: int = 1 << 32  # where the position rolls over, 2 to 2**32
-
-    def values(self) -> dict[tuple[int, int], int]:
-        """Return power-on values, by (index, subindex)."""
-        return {
-            (0x6001, 0): self.counts_per_rev,
-            (0x6002, 0): min(0xFFFF_FFFF, self.range_counts),
-            (0x6501, 0): self.counts_per_rev,
-            (0x6502, 0): min(0xFFFF, max(1, self.range_counts // self.counts_per_rev)),
-        }
-
-
 class Cia406Encoder(Node):
-    """The encoder at the link."""
+    """The encoder at the link.
+
+    Args:
+        range_counts: where the position rolls over, 2 to 2**32.
+    """
 
     sends_on_change = False  # CiA 406: the asynchronous TPDO goes by the cyclic timer
 
     def __init__(
-        self, node_id: int, scale: World, data: EncoderData | None = None, quirks: Quirks | None = None
+        self, node_id: int, scale: World, quirks: Quirks | None = None, *, range_counts: int = 1 << 32
     ) -> None:
-        self._scale = scale
-        self.data = data or EncoderData()
+        self._scale, self._range_counts = scale, range_counts
+        self._counts_per_rev = counts = round(scale.encoder.counts_per_rev)
+        plate = {
+            (0x6001, 0): counts,
+            (0x6002, 0): min(0xFFFF_FFFF, range_counts),
+            (0x6501, 0): counts,
+            (0x6502, 0): min(0xFFFF, max(1, range_counts // counts)),
+        }
         quirks = replace(quirks or Quirks(), eds="cia406-encoder")
-        super().__init__(node_id, with_values(load_eds(quirks.eds), self.data.values()), quirks)
+        super().__init__(node_id, with_values(load_eds(quirks.eds), plate), quirks)
         find = self.dictionary.find
         self._position, self._speed = find(0x6004, 0), find(0x6030, 1)
         self._offset, self._preset = find(0x6509, 0), find(0x6003, 0)
@@ -74,24 +67,24 @@ class Cia406Encoder(Node):
             raise SdoAbortedError(Abort.INVALID_VALUE)
 
     def _check_units(self, value: int) -> None:
-        if not 1 <= value <= self.data.counts_per_rev:
+        if not 1 <= value <= self._counts_per_rev:
             raise SdoAbortedError(Abort.TOO_HIGH if value else Abort.TOO_LOW)
 
     def _check_range(self, value: int) -> None:
-        if not 2 <= value <= min(0xFFFF_FFFF, self.data.range_counts):
+        if not 2 <= value <= min(0xFFFF_FFFF, self._range_counts):
             raise SdoAbortedError(Abort.TOO_HIGH if value > 1 else Abort.TOO_LOW)
 
     @property
     def _modulus(self) -> int:
         if self._operating.number & SCALING and self._range.number != 0xFFFF_FFFF:
             return self._range.number
-        return self.data.range_counts
+        return self._range_counts
 
     def _raw(self, counts: int) -> int:
         if self._operating.number & REVERSED:
             counts = -counts
         if self._operating.number & SCALING:
-            counts = counts * self._units.number // self.data.counts_per_rev
+            counts = counts * self._units.number // self._counts_per_rev
         return counts
 
     def _take_operating(self) -> None:

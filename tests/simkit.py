@@ -26,13 +26,9 @@ class StubRig:
 
     period_s = 0.001
 
-    def __init__(
-        self,
-        drive: DriveHardware = DriveHardware(),
-        encoder: LinkEncoder = LinkEncoder(),  # noqa: B008
-    ) -> None:
+    def __init__(self, drive: DriveHardware | None = None, encoder: LinkEncoder | None = None) -> None:
         self.tick, self.commands = 0, []
-        self.drives, self.encoder = (drive, drive), encoder
+        self.drives, self.encoder = (drive or DriveHardware(),) * 2, encoder or LinkEncoder()
         self.drive = lambda _motor: DriveSignals(100 * self.tick, 3.14159265358979, 0.5, 0.05)
         self.link_counts = lambda: 7 * self.tick
         self.command = lambda _motor, torque_nm: self.commands.append(torque_nm)

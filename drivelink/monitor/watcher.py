@@ -11,13 +11,12 @@ from collections import deque
 from typing import Any
 
 import zenoh
-import zenoh.ext
 
 from drivelink.errors import ZenohError
 from drivelink.monitor.view import JointView
 from drivelink.plaintext import clean_text
 from drivelink.pubsub.clientbase import PATIENCE_S, absent, ask
-from drivelink.pubsub.feed import DECODERS, MAX_CLAIMS, DaemonIdentity, source_of
+from drivelink.pubsub.feed import DECODERS, DOCUMENTS, MAX_CLAIMS, DaemonIdentity, follow_document, source_of
 
 MAX_JOINTS = 64  # limit on joints shown, also against invented names
 _QUEUE = 8192
@@ -60,17 +59,12 @@ class Watcher:
         self._claims: deque[zenoh.Sample] = deque()  # tokens that came since the last poll
         ring = zenoh.handlers.RingChannel
         key = self._key = f"{prefix}/{joint or '*'}"
-        history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
         try:
             self._streams: list[tuple[str, Any]] = [
                 (name, session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)))
                 for name in ("estimate", "external")
             ]
-            for name in ("status", "model", "finding"):
-                subscriber = zenoh.ext.declare_advanced_subscriber(
-                    session, f"{key}/{name}", ring(256), history=history
-                )
-                self._streams.append((name, subscriber))
+            self._streams += [(name, follow_document(session, f"{key}/{name}", 256)) for name in DOCUMENTS]
             heard = zenoh.handlers.Callback(self._token, indirect=False)
             self._tokens: Any = session.liveliness().declare_subscriber(
                 f"{key}/alive/**", heard, history=True
@@ -142,12 +136,8 @@ class Watcher:
             self.refused += 1
             return
         joint.heard_s = now_s
-        if kind == "status":
-            joint.view.status = message
-        elif kind == "model":
-            joint.view.model = message
-        elif kind == "finding":
-            joint.view.finding = message
+        if kind in DOCUMENTS:
+            setattr(joint.view, kind, message)
         elif kind == "sample":
             joint.view.history.add_sample(message.sample, message.stamp_ns * 1e-9)
         elif kind == "external":

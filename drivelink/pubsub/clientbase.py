@@ -18,12 +18,11 @@ from typing import Any
 
 import numpy as np
 import zenoh
-import zenoh.ext
 from numpy.typing import NDArray
 
 from drivelink.errors import ZenohError
 from drivelink.plaintext import clean_text
-from drivelink.pubsub.feed import DECODERS, WAKE, Feed, State, source_of
+from drivelink.pubsub.feed import DECODERS, DOCUMENTS, WAKE, Feed, State, follow_document, source_of
 from drivelink.pubsub.session import ENDPOINT, close_session, connected, one_line, open_client
 from drivelink.pubsub.wire import ESTIMATE, EstimateMessage, ExternalMessage
 from estimator.sample import Status
@@ -113,8 +112,7 @@ class Client:
         self._owned = session is None
         self._session = open_client(endpoint, config) if session is None else session
         self._feed = Feed(depth, stale_after_s, time.monotonic_ns())
-        self._documents: dict[str, tuple[str | None, dict[str, Any]]] = {}  # who wrote it, and what
-        self._external: tuple[str | None, ExternalMessage] | None = None  # who wrote it, and what
+        self._messages: dict[str, tuple[str | None, Any]] = {}  # the newest of each key: who wrote it, what
         self._closed = False
         self._leaving = threading.RLock()  # who closes second waits until the first is done
         self._prefix = prefix
@@ -126,19 +124,14 @@ class Client:
             raise ZenohError(f"{self.key}: {one_line(error)}") from error
 
     def _declare(self) -> None:
-        ring = zenoh.handlers.RingChannel
         liveliness = self._session.liveliness()
         # In zenoh's thread (indirect=False), which does not block the process's end; no token is dropped.
         heard = zenoh.handlers.Callback(self._feed.identity.heard, indirect=False)
         self._tokens = liveliness.declare_subscriber(f"{self.key}/alive/**", heard, history=True)
         self._estimates = self._declare_estimates(self.key + "/estimate")
-        self._externals = self._session.declare_subscriber(self.key + "/external", ring(1))
-        history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
-        self._latched = {
-            name: zenoh.ext.declare_advanced_subscriber(
-                self._session, f"{self.key}/{name}", ring(4), history=history
-            )
-            for name in ("status", "model", "finding")
+        external = self._session.declare_subscriber(self.key + "/external", zenoh.handlers.RingChannel(1))
+        self._newest_of = {"external": external} | {
+            name: follow_document(self._session, f"{self.key}/{name}", 4) for name in DOCUMENTS
         }
 
     def _declare_estimates(self, key: str) -> zenoh.Subscriber[Any]:
@@ -217,20 +210,11 @@ class Client:
 
         None: none belongs to the latest estimates; link dynamics may not be declared.
         """
-        self._drain()
-        feed = self._feed
-        with suppress(zenoh.ZError):
-            while (sample := self._externals.try_recv()) is not None:
-                if feed.trusts(source_of(sample), time.monotonic_ns()):
-                    try:
-                        message = DECODERS["external"](sample.payload.to_bytes())
-                        self._external = feed.identity.bound, message
-                    except ZenohError:
-                        feed.unusable += 1
-        writer, newest = self._external or (None, None)
-        if newest is None or feed.latest is None or writer != feed.identity.bound or self.stale:
+        newest: ExternalMessage | None = self._message("external")
+        estimate = self._feed.latest
+        if newest is None or estimate is None or self.stale:
             return None
-        return newest if abs(feed.latest.sequence - newest.sequence) <= _TOGETHER else None
+        return newest if abs(estimate.sequence - newest.sequence) <= _TOGETHER else None
 
     @property
     def contact(self) -> bool:
@@ -292,17 +276,12 @@ class Client:
         """Leave; a second time does nothing."""
         self._closed = True
         with self._leaving:
-            for name in ("_estimates", "_externals", "_tokens"):
-                self._undeclare(getattr(self, name, None))
-            for subscriber in getattr(self, "_latched", {}).values():
-                self._undeclare(subscriber)
+            entities = [getattr(self, name, None) for name in ("_estimates", "_tokens")]
+            for entity in (*entities, *getattr(self, "_newest_of", {}).values()):
+                with suppress(zenoh.ZError, AttributeError):
+                    entity.undeclare()
             if self._owned:
                 close_session(self._session)
-
-    @staticmethod
-    def _undeclare(entity: Any) -> None:
-        with suppress(zenoh.ZError, AttributeError):
-            entity.undeclare()
 
     def _fresh(self, bit: Status) -> bool:
         self._drain()
@@ -310,17 +289,22 @@ class Client:
         return latest is not None and bool(latest.status & bit) and not self.stale
 
     def _document(self, name: str) -> dict[str, Any] | None:
+        document: dict[str, Any] | None = self._message(name)
+        return document
+
+    def _message(self, name: str) -> Any:
+        """The newest message of a key that the daemon wrote, or None."""
         self._drain()
         identity = self._feed.identity
         with suppress(zenoh.ZError):
-            while (sample := self._latched[name].try_recv()) is not None:
+            while (sample := self._newest_of[name].try_recv()) is not None:
                 if self._feed.trusts(source_of(sample), time.monotonic_ns()):
                     try:
-                        self._documents[name] = identity.bound, DECODERS[name](sample.payload.to_bytes())
+                        self._messages[name] = identity.bound, DECODERS[name](sample.payload.to_bytes())
                     except ZenohError:
                         self._feed.unusable += 1
-        writer, document = self._documents.get(name, (None, None))
-        return document if writer == identity.bound else None
+        writer, message = self._messages.get(name, (None, None))
+        return message if writer == identity.bound else None
 
     def _hint(self) -> None:
         """Report once that there is no daemon of this name, and which others there are; never waits."""

@@ -23,6 +23,7 @@ from types import MappingProxyType
 from typing import Any
 
 import zenoh
+import zenoh.ext
 
 from drivelink.errors import ZenohError
 from drivelink.plaintext import clean_text
@@ -100,6 +101,20 @@ DECODERS: Mapping[str, Callable[[bytes], Any]] = MappingProxyType(
         "finding": decode_document,
     }
 )
+
+
+DOCUMENTS = ("status", "model", "finding")  # the keys whose last message a new subscriber gets at once
+
+
+def follow_document(session: zenoh.Session, key: str, depth: int) -> Any:
+    """Subscribe to a key of `DOCUMENTS`: its last message, then each new one, `depth` of them kept unread.
+
+    Raises:
+        zenoh.ZError: it cannot be subscribed to.
+    """
+    history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
+    ring: Any = zenoh.handlers.RingChannel(depth)
+    return zenoh.ext.declare_advanced_subscriber(session, key, ring, history=history)
 
 
 MAX_CLAIMS = (

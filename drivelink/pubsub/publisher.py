@@ -25,6 +25,7 @@ from drivelink._core import Tick
 from drivelink.canopen.layout import NodeLayout, layout_document
 from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, MotorSection
+from drivelink.pubsub.feed import DOCUMENTS
 from drivelink.pubsub.session import Stream, one_line
 from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, SAMPLE
 from drivelink.version import __version__
@@ -73,7 +74,7 @@ class JointPublisher:
             self._external = self._stream("external", EXTERNAL.schema, zenoh.Priority.REAL_TIME)
             self._sample = self._stream("sample", SAMPLE.schema, zenoh.Priority.INTERACTIVE_HIGH)
             self._snapshot = self._background("snapshot")
-            self._latched = {name: self._latch(name) for name in ("status", "model", "finding")}
+            self._latched = {name: self._latch(name) for name in DOCUMENTS}
             self._answer("schema", to_json(schema()))
             self.put_joint(joint)
             self._ros2 = self._open_ros2(joint)

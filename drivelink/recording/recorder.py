@@ -16,14 +16,13 @@ from typing import Any, Self
 
 import can
 import zenoh
-import zenoh.ext
 
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.sources import BusLostError, open_source
 from drivelink.errors import BusError, ZenohError
 from drivelink.jointfile import JointFile
-from drivelink.pubsub.feed import DECODERS, DaemonIdentity, source_of
+from drivelink.pubsub.feed import DECODERS, DaemonIdentity, follow_document, source_of
 from drivelink.recording.canlog import LoggedFrame
 from drivelink.recording.cycles import FrameSamples
 from drivelink.recording.limits import MAX_BLOCK_BYTES
@@ -74,7 +73,6 @@ class ZenohTap:
         self._heard_s = -math.inf
         key = f"{joint.zenoh.prefix}/{joint.name}"
         ring = zenoh.handlers.RingChannel
-        history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
         takers = {"sample": self._sample, "estimate": self._estimate, "external": self._external}
         self._streams: list[tuple[Any, Callable[[zenoh.Sample], None]]] = [
             (session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)), take)
@@ -85,10 +83,7 @@ class ZenohTap:
             plain = session.declare_subscriber(f"{key}/snapshot", ring(_SNAPSHOTS))
             self._streams.append((plain, self._snapshot))
         for name in ("status", "model") if "document" in sink.wants else ():
-            subscriber = zenoh.ext.declare_advanced_subscriber(
-                session, f"{key}/{name}", ring(16), history=history
-            )
-            self._streams.append((subscriber, self._document))
+            self._streams.append((follow_document(session, f"{key}/{name}", 16), self._document))
 
         # In zenoh's thread (indirect=False), which never keeps the process from ending.
         heard = zenoh.handlers.Callback(self._identity.heard, indirect=False)

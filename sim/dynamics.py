@@ -15,15 +15,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from sim.plant import JointPlant, LinkPlant, Load, MotorPlant
+from sim.plant import JointPlant, Load, MotorPlant
 
 State = list[float]
-"""[q, q', theta_1, theta_1', theta_2, theta_2'], rad and rad/s."""
+"""[q, q', theta_1, theta_1', theta_2, theta_2'], rad and rad/s; a second motor that is not there rests."""
 
-Pair = Callable[[float, float, float, float, float, float], tuple[float, float]]
-"""(q, q', theta, theta', tau, tau_k) -> accelerations of link and motor."""
-Triple = Callable[[float, float, float, float, float, float, float, float, float], tuple[float, float, float]]
-"""(q, q', theta_1, theta_1', theta_2, theta_2', tau_1, tau_2, tau_k) -> three accelerations."""
+Triple = tuple[float, float, float]
+Carried = Callable[[float, float, float, float, float, float], Triple]
+"""(q, q', theta_1, theta_1', theta_2, theta_2') -> torque of the transmissions on link and motors, N·m."""
+Accelerations = Callable[[float, float, float, float, float, float, float, float, float], Triple]
+"""(q, q', theta_1, theta_1', theta_2, theta_2', tau_1, tau_2, tau_k) -> accelerations of each, rad/s²."""
 Coupling = Callable[[float, float, float, float], tuple[float, float]]
 """(q, q', theta, theta') -> transmission torque on the link and on the motor (they differ by de/dtheta)."""
 
@@ -50,24 +51,33 @@ def _coupling(motor: MotorPlant) -> Coupling:
     return couple
 
 
-def transmission_torques(plant: JointPlant) -> Callable[[State], tuple[float, ...]]:
-    """State -> tau_e,i on each motor (N·m); zero at a rigid coupling, which has no law."""
+def carried(plant: JointPlant) -> Carried:
+    """Return the torque of the transmissions on each body; zero at a rigid coupling, which has no law."""
     if plant.rigid:
-        return lambda state: (0.0,)
-    if plant.arrangement == "serial":
-        couple, reaction = _coupling(plant.motors[0]), _reaction(plant)
+        return lambda q, v, theta1, w1, theta2, w2: (0.0, 0.0, 0.0)
+    couple1, couple2 = (_coupling(motor) for motor in (plant.motors[0], plant.motors[-1]))
+    lever = plant.lever_per_rad
 
-        def serial(state: State) -> tuple[float, ...]:
-            q, v, theta1, w1, theta2, _ = state
-            ratio = 1.0 + plant.lever_per_rad * theta2
-            return ratio * ratio * couple(q, v, theta1, w1)[1], reaction(q, theta1, ratio)
+    def single(q: float, v: float, theta1: float, w1: float, theta2: float, w2: float) -> Triple:
+        on_link, on_motor = couple1(q, v, theta1, w1)
+        return -on_link, on_motor, 0.0
 
-        return serial
-    couplings = tuple(_coupling(motor) for motor in plant.motors)
-    return lambda state: tuple(
-        couple(state[0], state[1], state[2 + 2 * i], state[3 + 2 * i])[1]
-        for i, couple in enumerate(couplings)
-    )
+    def antagonistic(q: float, v: float, theta1: float, w1: float, theta2: float, w2: float) -> Triple:
+        on_link1, on_motor1 = couple1(q, v, theta1, w1)
+        on_link2, on_motor2 = couple2(q, v, theta2, w2)
+        return -on_link1 - on_link2, on_motor1, on_motor2
+
+    if plant.arrangement != "serial":
+        return single if plant.arrangement == "single" else antagonistic
+    reaction = _reaction(plant)
+
+    def serial(q: float, v: float, theta1: float, w1: float, theta2: float, w2: float) -> Triple:
+        ratio = 1.0 + lever * theta2
+        square = ratio * ratio
+        on_link, on_motor = couple1(q, v, theta1, w1)
+        return -square * on_link, square * on_motor, reaction(q, theta1, ratio)
+
+    return serial
 
 
 def elasticity(plant: JointPlant) -> Callable[[State], tuple[tuple[float, float], ...]]:
@@ -103,11 +113,10 @@ def _reaction(plant: JointPlant) -> Callable[[float, float, float], float]:
     return lambda q, theta1, ratio: twice * ratio * potential(phi(q, theta1))
 
 
-def _motor_load(motor: MotorPlant) -> Load:
-    return _load(motor.viscous_damping_nm_s_rad, motor.terms.loads)
-
-
 def _load(damping: float, loads: list[Load]) -> Load:
+    if not loads:
+        return lambda position, velocity: damping * velocity
+
     def load(position: float, velocity: float) -> float:
         total = damping * velocity
         for x in loads:
@@ -117,84 +126,25 @@ def _load(damping: float, loads: list[Load]) -> Load:
     return load
 
 
-def _link_load(link: LinkPlant) -> Load:
-    sin, d, g, phase = math.sin, link.viscous_damping_nm_s_rad, link.gravity_nm, link.gravity_phase_rad
-    if not link.terms.loads:
-        return lambda q, v: d * v + g * sin(q + phase)
-    further = _load(d, link.terms.loads)
-    return lambda q, v: further(q, v) + g * sin(q + phase)
+def accelerations(plant: JointPlant) -> Accelerations:
+    """Return accelerations of link and motors; a rigid joint is one body of inertia B + M."""
+    link, sin, torques = plant.link, math.sin, carried(plant)
+    g, phase, m = link.gravity_nm, link.gravity_phase_rad, link.inertia_kg_m2
+    on_link = _load(link.viscous_damping_nm_s_rad, link.terms.loads)
+    on1, on2 = (_load(x.viscous_damping_nm_s_rad, x.terms.loads) for x in (plant.motors[0], plant.motors[-1]))
+    b1, b2 = plant.motors[0].inertia_kg_m2, plant.motors[1].inertia_kg_m2 if plant.motors[1:] else math.inf
+    rigid, whole = plant.rigid, b1 + m
 
-
-def equations(plant: JointPlant) -> Pair | Triple:
-    """Return accelerations of the joint as one closure."""
-    if plant.rigid:
-        return _rigid(plant)
-    if plant.arrangement == "serial":
-        return _serial(plant)
-    return _single(plant) if plant.arrangement == "single" else _antagonistic(plant)
-
-
-def _rigid(plant: JointPlant) -> Pair:
-    """One body of inertia B + M: link and motor get the same acceleration."""
-    motor_load, link_load = _motor_load(plant.motors[0]), _link_load(plant.link)
-    inertia = plant.motors[0].inertia_kg_m2 + plant.link.inertia_kg_m2
-
-    def acc(q: float, v: float, theta: float, w: float, tau: float, tau_k: float) -> tuple[float, float]:
-        a = (tau + tau_k - motor_load(theta, w) - link_load(q, v)) / inertia
-        return a, a
-
-    return acc
-
-
-def _single(plant: JointPlant) -> Pair:
-    motor, link_load, m = plant.motors[0], _link_load(plant.link), plant.link.inertia_kg_m2
-    couple, load, b = _coupling(motor), _motor_load(motor), motor.inertia_kg_m2
-
-    def acc(q: float, v: float, theta: float, w: float, tau: float, tau_k: float) -> tuple[float, float]:
-        on_link, on_motor = couple(q, v, theta, w)
-        return (tau_k - on_link - link_load(q, v)) / m, (tau + on_motor - load(theta, w)) / b
-
-    return acc
-
-
-def _antagonistic(plant: JointPlant) -> Triple:
-    link_load, m = _link_load(plant.link), plant.link.inertia_kg_m2
-    couple1, couple2 = (_coupling(motor) for motor in plant.motors)
-    load1, load2 = (_motor_load(motor) for motor in plant.motors)
-    b1, b2 = (motor.inertia_kg_m2 for motor in plant.motors)
-
-    def acc(
+    def accelerated(
         q: float, v: float, theta1: float, w1: float, theta2: float, w2: float,
         tau1: float, tau2: float, tau_k: float,
-    ) -> tuple[float, float, float]:  # fmt: skip
-        on_link1, on_motor1 = couple1(q, v, theta1, w1)
-        on_link2, on_motor2 = couple2(q, v, theta2, w2)
-        return (
-            (tau_k - on_link1 - on_link2 - link_load(q, v)) / m,
-            (tau1 + on_motor1 - load1(theta1, w1)) / b1,
-            (tau2 + on_motor2 - load2(theta2, w2)) / b2,
-        )
+    ) -> Triple:  # fmt: skip
+        te, te1, te2 = torques(q, v, theta1, w1, theta2, w2)
+        at_link = tau_k + te - on_link(q, v) - g * sin(q + phase)
+        at_motor = tau1 + te1 - on1(theta1, w1)
+        if rigid:
+            a = (at_link + at_motor) / whole
+            return a, a, 0.0
+        return at_link / m, at_motor / b1, (tau2 + te2 - on2(theta2, w2)) / b2
 
-    return acc
-
-
-def _serial(plant: JointPlant) -> Triple:
-    link_load, m, lever = _link_load(plant.link), plant.link.inertia_kg_m2, plant.lever_per_rad
-    couple, reaction = _coupling(plant.motors[0]), _reaction(plant)
-    load1, load2 = (_motor_load(motor) for motor in plant.motors)
-    b1, b2 = (motor.inertia_kg_m2 for motor in plant.motors)
-
-    def acc(
-        q: float, v: float, theta1: float, w1: float, theta2: float, w2: float,
-        tau1: float, tau2: float, tau_k: float,
-    ) -> tuple[float, float, float]:  # fmt: skip
-        ratio = 1.0 + lever * theta2
-        square = ratio * ratio
-        on_link, on_motor = couple(q, v, theta1, w1)
-        return (
-            (tau_k - square * on_link - link_load(q, v)) / m,
-            (tau1 + square * on_motor - load1(theta1, w1)) / b1,
-            (tau2 + reaction(q, theta1, ratio) - load2(theta2, w2)) / b2,
-        )
-
-    return acc
+    return accelerated

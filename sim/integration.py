@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import cast
 
-from sim.dynamics import Pair, State, Triple, equations, spring_deflection, transmission_torques
+from sim.dynamics import State, accelerations, carried, spring_deflection
 from sim.errors import SimError
 from sim.plant import Dry, JointPlant
 
@@ -28,32 +27,7 @@ def integrator(plant: JointPlant, step_s: float) -> Step:
     For x" = a(x, x') the four classical stages read, with one acceleration each,
         x+ = x + h v + h²/6 (a1 + a2 + a3),  v+ = v + h/6 (a1 + 2 a2 + 2 a3 + a4).
     """
-    if len(plant.motors) == 2:
-        return _rk4_triple(cast(Triple, equations(plant)), step_s)
-    return _rk4_pair(cast(Pair, equations(plant)), step_s)
-
-
-def _rk4_pair(acc: Pair, h: float) -> Step:
-    half, quarter, whole, sixth, sixth2 = h / 2, h * h / 4, h * h / 2, h / 6, h * h / 6
-
-    def step(state: State, tau: float, _: float, tau_k: float) -> None:
-        q, v, p, w = state
-        a1, b1 = acc(q, v, p, w, tau, tau_k)
-        qm, pm = q + half * v, p + half * w
-        a2, b2 = acc(qm, v + half * a1, pm, w + half * b1, tau, tau_k)
-        a3, b3 = acc(qm + quarter * a1, v + half * a2, pm + quarter * b1, w + half * b2, tau, tau_k)
-        q += h * v
-        p += h * w
-        a4, b4 = acc(q + whole * a2, v + h * a3, p + whole * b2, w + h * b3, tau, tau_k)
-        state[0] = q + sixth2 * (a1 + a2 + a3)
-        state[1] = v + sixth * (a1 + 2.0 * (a2 + a3) + a4)
-        state[2] = p + sixth2 * (b1 + b2 + b3)
-        state[3] = w + sixth * (b1 + 2.0 * (b2 + b3) + b4)
-
-    return step
-
-
-def _rk4_triple(acc: Triple, h: float) -> Step:
+    acc, h = accelerations(plant), step_s
     half, quarter, whole, sixth, sixth2 = h / 2, h * h / 4, h * h / 2, h / 6, h * h / 6
 
     def step(state: State, tau1: float, tau2: float, tau_k: float) -> None:
@@ -132,17 +106,17 @@ def settling(plant: JointPlant, step_s: float) -> Settle | None:
     ]
     if not bodies and not commits:
         return None
-    torques, rigid = transmission_torques(plant), plant.rigid
+    torques, rigid = carried(plant), plant.rigid
 
     def settle(state: State, time_s: float) -> None:
         if bodies:
-            loads = torques(state)
-            for index, motor, dry, per_inertia in bodies:
+            loads = torques(*state)
+            for body, dry, per_inertia in bodies:
+                index = 2 * body
                 position, velocity = state[index], state[index + 1]
-                load = sum(loads) if motor is None else loads[motor]
                 level = 0.0
                 for friction in dry:
-                    level += friction(position, velocity, load, time_s)
+                    level += friction(position, velocity, loads[body], time_s)
                 after = _braked(velocity, level * per_inertia)
                 # Friction acted all along the step: half its change of velocity belongs in the position.
                 state[index] = position + 0.5 * step_s * (after - velocity)
@@ -161,19 +135,13 @@ def _braked(velocity: float, most: float) -> float:
     return velocity + most if velocity < -most else 0.0
 
 
-def _dry_bodies(plant: JointPlant, step_s: float) -> list[tuple[int, int | None, list[Dry], float]]:
-    """Bodies with friction: (index of position, motor or None for the link, levels, step over inertia)."""
-    link = plant.link
+def _dry_bodies(plant: JointPlant, step_s: float) -> list[tuple[int, list[Dry], float]]:
+    """Bodies with friction: (0 the link, 1 and 2 the motors; levels; step over inertia)."""
+    link, motors = plant.link, plant.motors
     if plant.rigid:
-        motor = plant.motors[0]
-        inertia = motor.inertia_kg_m2 + link.inertia_kg_m2
-        found: list[tuple[int, int | None, list[Dry], float]] = [
-            (2, 0, motor.terms.dry + link.terms.dry, step_s / inertia)
-        ]
+        inertia = motors[0].inertia_kg_m2 + link.inertia_kg_m2
+        found = [(1, motors[0].terms.dry + link.terms.dry, step_s / inertia)]
     else:
-        found = [
-            (2 + 2 * i, i, motor.terms.dry, step_s / motor.inertia_kg_m2)
-            for i, motor in enumerate(plant.motors)
-        ]
-        found.append((0, None, link.terms.dry, step_s / link.inertia_kg_m2))
-    return [body for body in found if body[2]]
+        found = [(k, motor.terms.dry, step_s / motor.inertia_kg_m2) for k, motor in enumerate(motors, 1)]
+        found.append((0, link.terms.dry, step_s / link.inertia_kg_m2))
+    return [body for body in found if body[1]]

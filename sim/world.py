@@ -223,7 +223,7 @@ def _start(initial_rad: Sequence[float], motors: int, rigid: bool) -> list[float
         raise SimError(f"initial_rad: expected {1 + motors} finite numbers, got {positions!r}")
     if rigid and positions[0] != positions[1]:
         raise SimError(f"initial_rad: expected q = theta at a rigid transmission, got {positions!r}")
-    return [value for position in positions for value in (position, 0.0)]
+    return [value for position in (*positions, 0.0)[:3] for value in (position, 0.0)]
 
 
 def record(world: World, seconds: float) -> dict[str, NDArray[np.float64]]:

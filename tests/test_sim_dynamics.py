@@ -15,9 +15,10 @@ SPRINGS = [LINEAR, HARDENING, VSA_II, EXPONENTIAL]
 
 
 def run(plant, state, seconds, step_s, tau=0.0):
-    step = integrator(plant, step_s)
+    step, whole = integrator(plant, step_s), [*state, 0.0, 0.0][:6]
     for _ in range(round(seconds / step_s)):
-        step(state, tau, 0.0, 0.0)
+        step(whole, tau, 0.0, 0.0)
+    state[:] = whole[: len(state)]
     return state
 
 

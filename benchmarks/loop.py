@@ -80,9 +80,8 @@ def closed(name: str, share: float) -> scene.Row:
         begin = len(taken.samples)
         while not taken.alarm and len(taken.samples) < begin + PATIENCE_S * per_s:
             daemon.run_lockstep(per_s // 20)
-        if not taken.alarm:
-            return result
-        result["alarm_s"] = (len(taken.samples) - begin) / per_s
+        if taken.alarm:
+            result["alarm_s"] = (len(taken.samples) - begin) / per_s
         daemon.run_lockstep(round(AFTER_S * per_s))
         kept = list(taken.samples)
         daemon.run_lockstep(round(WATCHED_S * per_s))
@@ -136,14 +135,10 @@ def ratio_of(joint: jointfile.JointFile, samples: Sequence[Sample]) -> tuple[flo
 
 def shown(one: scene.Row) -> scene.Row:
     """Add what a table says in words."""
-    if one["alarm_s"] is None:
-        return one | dict.fromkeys(
-            ("finding_s", "said", "error_before", "error_after", "before_ratio", "after")
-        )
     error, after = one.get("error") or {}, one.get("after_ratio")
     said = "yes" if one.get("named") else f"listed ({one['found'][0]})" if one.get("listed") else None
     return one | {
-        "finding_s": one["alarm_s"] + AFTER_S + one.get("diagnosis_s", 0.0),
+        "finding_s": (one["alarm_s"] or 0.0) + AFTER_S + one.get("diagnosis_s", 0.0),
         "said": said or ", ".join(one.get("found") or ()) or one["state"],
         "error_before": error.get("before_relative"),
         "error_after": error.get("after_relative"),
@@ -154,13 +149,13 @@ def shown(one: scene.Row) -> scene.Row:
 
 def total(made: list[scene.Row]) -> str:
     """All effects together."""
-    alarmed = [one for one in made if one["alarm_s"] is not None]
-    proposed = [one for one in alarmed if one["state"] == finding.PROPOSED]
+    alarmed = sum(one["alarm_s"] is not None for one in made)
+    proposed = [one for one in made if one["state"] == finding.PROPOSED]
     quiet = sum(not one["alarm_after"] for one in proposed)
     return (
-        f"Residuals are times their baseline. Of {len(made)} effects {len(alarmed)} alarm, "
-        f"{sum(bool(one.get('named')) for one in alarmed)} are named first, "
-        f"{sum(bool(one.get('listed')) for one in alarmed)} named or listed. {len(proposed)} lead to a "
+        f"Residuals are times their baseline. Of {len(made)} effects {alarmed} alarm, "
+        f"{sum(bool(one.get('named')) for one in made)} are named first, "
+        f"{sum(bool(one.get('listed')) for one in made)} named or listed. {len(proposed)} lead to a "
         f"proposal; of {quiet} of these the new test stays quiet for {WATCHED_S:g} s. "
         f"False alarms before the effect: {sum(one['false_alarm'] for one in made)}."
     )

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,10 +50,11 @@ def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
     """
     units = Units(joint.axis == "linear")
     fall = f"{error.before_relative:.2%} to {error.after_relative:.2%}"
-    on = "on held-out data the error of the motor torque"
+    on = f"on held-out data the error of the {'link' if _of_link(outcome) else 'motor'} torque"
     if outcome.verdict == "effect":
         names = " and ".join(sentences.title_of(one, outcome) for one in outcome.effects)
-        sentence, short = f"{sentences.lacks(outcome)}: {on} falls from {fall}.", f"{names}, error {fall}"
+        how = "falls" if error.after_rms_nm < error.before_rms_nm else "does not fall, but goes"
+        sentence, short = f"{sentences.lacks(outcome)}: {on} {how} from {fall}.", f"{names}, error {fall}"
     elif outcome.verdict == "sufficient" and error.after_rms_nm < 0.5 * error.before_rms_nm:
         sentence = f"No effect is missing, but the joint has changed: refitted, {on} falls from {fall}."
         short = f"the joint has changed, error {fall}"
@@ -60,6 +62,11 @@ def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
         sentence = sentences.sentence(outcome)
         short = sentence.partition(":")[0].rstrip(".")
     return Summary(sentence, short, tuple(_parameters(outcome, joint, units)))
+
+
+def _of_link(outcome: Diagnosis) -> bool:
+    """Whether all that was found is in the link's balance alone (eq 4), where the motor's shows nothing."""
+    return bool(outcome.effects) and all(one.location == "link" for one in outcome.effects)
 
 
 def _parameters(outcome: Diagnosis, joint: JointFile, units: Units) -> list[str]:
@@ -119,13 +126,14 @@ def make(recording: Path) -> dict[str, Any]:
     held_from = int(part.sequence[round(_TRAINED * (len(part) - 1))])
     trained, held = part.rows(part.sequence < held_from), part.rows(part.sequence >= held_from)
     outcome = diagnose(trained, model, None, held)
-    error, state = _error(part, source.joint, outcome, held_from), finding.NOTHING
-    said, harmful = summary(outcome, error, source.joint), None
-    if error.after_rms_nm < error.before_rms_nm and _has_changed(part, source.joint, outcome):
-        proposed = apply_diagnosis.diagnosed_model(source.joint, outcome)
+    change = _change(part, source.joint, outcome)
+    error, state = _error(part, source.joint, change, held_from), finding.NOTHING
+    said, harmful = summary(change, error, source.joint), None
+    if error.after_rms_nm < error.before_rms_nm and _has_changed(part, source.joint, change):
+        proposed = apply_diagnosis.diagnosed_model(source.joint, change)
         harmful = harm(model, proposed, [Unseen(part, held_from)], source.joint.estimator)
         if harmful is None:
-            apply_diagnosis.write(source, proposal_file(recording), outcome, part, recording.name, force=True)
+            apply_diagnosis.write(source, proposal_file(recording), change, part, recording.name, force=True)
             state = finding.PROPOSED
     title = report.Title(source.joint.name, recording.name, None, source.joint.axis == "linear")
     write_whole(page_file(recording), report.html_page(outcome, title), force=True)
@@ -146,24 +154,38 @@ def _has_changed(part: Record, joint: JointFile, outcome: Diagnosis) -> bool:
     """Whether an effect was found, or the model in use fails its own test."""
     if outcome.verdict != "sufficient":
         return outcome.verdict == "effect"
+    return _alarms(part, joint)
+
+
+def _alarms(part: Record, joint: JointFile) -> bool:
     monitor = make_model_monitor(joint)
     return monitor is not None and any(map(monitor.core.step, part.samples()))
 
 
+def _change(part: Record, joint: JointFile, outcome: Diagnosis) -> Diagnosis:
+    """What is to change: nothing of motors that pass their own test, where what was found is on the link."""
+    if not _of_link(outcome) or not can_monitor(joint.model()) or _alarms(part, joint):
+        return outcome
+    kept = tuple(replace(one, parameters={}, motor={}) for one in outcome.transmissions)
+    return replace(outcome, transmissions=kept, alignment={})
+
+
 def _error(part: Record, joint: JointFile, outcome: Diagnosis, held_from: int) -> Errors:
-    """The error on held-out data of the model in use and of the proposed one.
+    """The error on held-out data of the model in use and of the proposed one: of the motors, or of the link
+    where what was found is there.
 
     Of a model without parameters, which is no model yet, the error before is that of its best fit.
     """
     declared, later = joint.model(), held_from + 1 / part.period_s
     if not can_monitor(declared):
         return outcome.validation
-    both = []
+    motors, both = part.motors, []
+    judged = slice(motors, None) if _of_link(outcome) else slice(motors)
     for one in (declared, apply_diagnosis.diagnosed_model(joint, outcome)):
         held = [second for second in seconds_of(part, one) if second.sequence > later]
         if not held:
             return outcome.validation
-        squares = np.square([(s.residual_nm[: part.motors], s.torque_nm[: part.motors]) for s in held])
+        squares = np.square([(s.residual_nm[judged], s.torque_nm[judged]) for s in held])
         both.append(np.sqrt(np.mean(np.sum(squares, axis=2), axis=0)).tolist())
     (before, torque), (after, _) = both
     return Errors(before, after, before / torque, after / torque)

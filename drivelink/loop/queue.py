@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import subprocess
 import sys
 import time
@@ -18,6 +19,7 @@ _LOG = logging.getLogger("drivelink.loop")
 _APART_S = 60.0  # events closer than this are one
 _LONGEST_S = 3600.0  # that one diagnosis may take
 _UNDER_WAY = "what the model may lack is being looked for"
+_SAID_S = 10.0  # that a diagnosis waits for the processors before it is said, and between two such sentences
 
 
 class Diagnoses:
@@ -30,6 +32,9 @@ class Diagnoses:
         self._recording: Path | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._since_s = 0.0
+        self._before = (0.0, 0.0)  # time of the last step, and CPU time of the process then
+        self._worked_s = 0.0  # when it last had half of a processor, or wanted none
+        self._said_s = 0.0  # for how long it was said to wait
 
     def step(self) -> None:
         """End what is done and begin what is due; called once a second."""
@@ -37,6 +42,7 @@ class Diagnoses:
             if self._process.poll() is None:
                 if time.monotonic() - self._since_s > _LONGEST_S:
                     self._process.kill()
+                self._watch(self._process.pid)
                 return
             self._end(self._process.returncode)
         try:
@@ -61,12 +67,27 @@ class Diagnoses:
     def _begin(self, recording: Path) -> None:
         self._tried.add(recording)
         self._recording, self._since_s = recording, time.monotonic()
+        self._before, self._worked_s, self._said_s = (self._since_s, 0.0), self._since_s, 0.0
         self._say(finding.DIAGNOSING, _UNDER_WAY)
         command = [sys.executable, "-m", "drivelink.loop.diagnosing", str(recording)]
         try:
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         except OSError as error:
             self._say(finding.FAILED, f"its diagnosis cannot be started: {error.strerror}")
+
+    def _watch(self, pid: int) -> None:
+        """Say it while the processors are too busy for the diagnosis, and when it goes on."""
+        now_s, (state, cpu_s) = time.monotonic(), _of_process(pid)
+        before_s, had_s = self._before
+        self._before = now_s, cpu_s
+        if state != "R" or cpu_s - had_s > 0.5 * (now_s - before_s):
+            self._worked_s = now_s
+        waited_s = now_s - self._worked_s
+        waited_s -= waited_s % _SAID_S
+        if waited_s != self._said_s:
+            self._said_s = waited_s
+            waits = f"diagnosis waits: processors busy since {waited_s:.0f} s"
+            self._say(finding.DIAGNOSING, waits if waited_s else _UNDER_WAY)
 
     def _end(self, status: int) -> None:
         recording, self._recording, self._process = self._recording, None, None
@@ -84,6 +105,15 @@ class Diagnoses:
         if self._recording is not None:
             with suppress(DrivelinkError):  # of a full disk: the black box says so
                 finding.write(self._recording, finding.begun(self._recording, state, sentence))
+
+
+def _of_process(pid: int) -> tuple[str, float]:
+    """State of a process (R: runs or waits for a processor) and its CPU time, s; "", 0 where nobody says."""
+    try:
+        values = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return values[0], (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, IndexError, ValueError):
+        return "", 0.0
 
 
 def next_due(folder: Path, joint: str, tried: Collection[Path] = ()) -> Path | None:

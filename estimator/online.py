@@ -9,7 +9,8 @@ import numpy as np
 
 from estimator import _core
 from estimator.effects import elements
-from estimator.model import JointModel, Motor, require_finite
+from estimator.model import JointModel, Motor
+from estimator.ranges import require_in_range
 from estimator.reasons import reason_text
 from estimator.sample import Consistency, Estimate, External, Sample
 from estimator.settings import EstimatorSettings
@@ -225,5 +226,5 @@ def make_estimator(model: JointModel, settings: EstimatorSettings, period_s: flo
     Raises:
         EstimatorError: the model names a transmission that does not exist, or contradicts itself.
     """
-    require_finite(0.0, strict=True, period_s=period_s)
+    require_in_range("period_s", period_s, positive=True)
     return _Compiled(model, settings, period_s)

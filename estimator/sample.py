@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import EstimatorError
+from estimator.ranges import require_in_range
 
 __all__ = [
     "SIGMA_95",
@@ -207,6 +208,7 @@ class Record:
 
     def __post_init__(self) -> None:
         n = len(self.sequence)
+        require_in_range("period_s", self.period_s, positive=True)
         if self.motor_position_rad.ndim != 2 or self.motor_position_rad.shape[1] not in (1, 2):
             raise EstimatorError(
                 f"motor_position_rad: expected (n, 1 or 2), got {self.motor_position_rad.shape}"

@@ -174,3 +174,11 @@ def test_a_number_that_cannot_be_is_one_line_in_every_verb(verb):
         for wrong in ("nan", "inf", "-1", "-1e9", "", "x", beyond, *zero):
             with pytest.raises(UsageError, match=f"^{option}: expected a .*number .*, got {wrong}$"):
                 action.type(wrong)
+
+
+def test_ctrl_c_while_an_error_is_said_ends_without_a_traceback(monkeypatch, tmp_path):
+    def pressed(*_: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_fail", pressed)
+    assert main(["run", str(tmp_path / "nosuch.toml")]) == 130

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 from zenohkit import LIMIT_S, until
 
-from drivelink import jointfile
+from drivelink import cli, jointfile
 from drivelink._core import Tick
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.closedloop import STEPS
@@ -22,6 +22,7 @@ from drivelink.demo.closing import Comparison, as_json, closing_table
 from drivelink.demo.rig import RunSummary
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint, world_from_joint
+from drivelink.demo.watching import DemoRun
 from drivelink.monitor.history import TruePoint
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Status, TransmissionEstimate
@@ -97,6 +98,13 @@ def closing(comparison: Comparison) -> str:
     console = Console(width=100, record=True, file=io.StringIO())
     console.print(closing_table("vsa-ii", comparison, SUMMARY, 1150, 1e-3))
     return console.export_text()
+
+
+@pytest.mark.parametrize(("interrupted", "status"), [(True, 130), (False, 1)])
+def test_a_rig_that_ctrl_c_ended_first_has_not_ended_unexpectedly(interrupted, status, monkeypatch, capsys):
+    monkeypatch.setattr(DemoRun, "follow", lambda *_: interrupted)
+    assert cli.main(["demo", "--headless", "--case", "constant"]) == status
+    assert ("ended unexpectedly" in capsys.readouterr().err) is not interrupted
 
 
 def test_an_end_before_the_first_valid_cycle_gives_no_error():

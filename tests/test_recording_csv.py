@@ -174,6 +174,7 @@ HEAD = "time_s,motor1_position_rad,motor1_torque_nm\n"
         (lambda t: np.column_stack((np.zeros(50), t[:, 1:])), "stands still"),
         (lambda t: np.column_stack((t[:, 0] * np.nan, t[:, 1:])), "at least 3 samples, got 0"),
         (lambda t: np.vstack((t, t)), "time_s runs backwards 1 time"),
+        (lambda t: np.column_stack((t[:, 0] * 1e-6, t[:, 1:])), "period_s: expected 1e-06 to 100 s, got 1e-09"),
         (lambda t: np.column_stack((t[:, 0] ** 2, t[:, 1:])), "expected uniform sampling"),
         (lambda t: np.column_stack((t[:, :2], t[:, 2] * np.nan, t[:, 3])), "motor1_torque_nm holds no numeric value"),
         ("", "expected a CSV file with a line of column names"),

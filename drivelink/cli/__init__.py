@@ -107,6 +107,13 @@ def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit status."""
+    try:
+        return _main(argv)
+    except KeyboardInterrupt:  # also while an error is being said
+        return _INTERRUPTED
+
+
+def _main(argv: list[str] | None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     verb = argv[0] if argv and argv[0] in VERBS else ""
     # Some interfaces log every partial read, or a traceback for what they also raise.
@@ -135,8 +142,6 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _fail(verb, f"{where}{error.strerror or error}", 1)
-    except KeyboardInterrupt:
-        return _INTERRUPTED
 
 
 def _verb_parser(parser: argparse.ArgumentParser, verb: str) -> argparse.ArgumentParser:

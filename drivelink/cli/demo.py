@@ -65,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
             interrupted = shown.follow(rig, subscription)
     summary = shown.summary
     if summary is None:
+        if interrupted:
+            return 130
         raise DrivelinkError("the simulated drive and the daemon ended unexpectedly")
     if not args.json:
         console.print(closing_table(args.case, shown.comparison, summary, shown.received, joint.bus.period_s))
@@ -90,6 +92,8 @@ def _closed_loop(args: argparse.Namespace, console: Console, *, live: bool) -> i
         ):
             interrupted = run.follow(rig, subscription)
     if run.summary is None:
+        if interrupted:
+            return 130
         raise DrivelinkError("the simulated drive and the daemon ended unexpectedly")
     document = closedloop.result(args.case, run, run.summary)
     if args.json:

@@ -156,7 +156,8 @@ class JointView:
         touch = self.history.touch
         if touch is None:
             return []
-        return [f"external {number(touch.torque_nm)} N·m," if touch.valid else "external not valid,"]
+        said = with_interval(touch.torque_nm, SIGMA_95 * touch.std_nm, "N·m") if touch.valid else "not valid"
+        return [f"external {said},"]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         width = options.max_width

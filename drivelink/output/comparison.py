@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 
 from drivelink.output import plots
 from drivelink.output.document import Chart, Document, Grid, Paragraph, Rows, Section
-from drivelink.output.numbers import Units
+from drivelink.output.numbers import Units, number, value_and_interval
 from estimator.comparison import Correlation, Curve, correlations, friction_curve, stiffness_curve
 from estimator.errors import EstimatorError
 from estimator.freerun import FreeRun, free_run
 from estimator.model import JointModel
-from estimator.sample import Record
+from estimator.sample import SIGMA_95, Record
 
 _POINTS = 200
 _SHOWN_S = 10.0  # of a free run in the picture
@@ -143,10 +143,9 @@ class Comparison:
         for one in self.differences():
             unit = self.units.shown("N·m/rad" if one.kind == "stiffness" else "N·m")
             apart = f"{abs(one.b - one.a) / one.std:.1f} σ" if one.std > 0.0 else "–"
-            at = f"{one.at:.3g} {self.units.shown('rad' if one.kind == 'stiffness' else 'rad/s')}"
-            rows.append(
-                (f"{one.kind}, motor {one.motor}", at, f"{one.a:.5g} {unit}", f"{one.b:.5g} {unit}", apart)
-            )
+            at = f"{number(one.at, 3)} {self.units.shown('rad' if one.kind == 'stiffness' else 'rad/s')}"
+            a, b = (value_and_interval(value, SIGMA_95 * one.std)[0] for value in (one.a, one.b))
+            rows.append((f"{one.kind}, motor {one.motor}", at, f"{a} {unit}", f"{b} {unit}", apart))
         return Grid(("where they differ most", "at", "A", "B", "apart"), rows)
 
     def _fits(self) -> Grid:

@@ -330,11 +330,11 @@ class Bench:
 
     def describe(self) -> str:
         """Return joints and node ids, for messages."""
-        parts = []
-        for name, group in self._groups:
-            kinds = (f"{'drive' if isinstance(n, Cia402Drive) else 'encoder'} {n.node_id}" for n in group)
-            parts.append(f"{name} ({', '.join(kinds)})")
-        return "; ".join(parts)
+        joints = []
+        for name, kinds in self.devices().items():
+            nodes = (f"{kind} {node_id}" for kind, ids in kinds.items() for node_id in ids)
+            joints.append(f"{name} ({', '.join(nodes)})")
+        return "; ".join(joints)
 
     def write_eds(self, directory: Path) -> None:
         """Write the EDS file of every device."""

@@ -82,7 +82,7 @@ class World:
         self.period_s = period_s
         self.substeps = whole_fraction(period_s, plant_step_s, plant, fine=bool(effects))
         self.plant_step_s = period_s / self.substeps
-        self._declared = plant
+        self.declared = plant  # its physics without the effects
         self._effects = tuple(effects)
         self._state = _start(initial_rad, self.motors, plant.rigid)
         self._tick, self._external = 0, 0.0
@@ -94,11 +94,6 @@ class World:
         self._scale = LinkScale(self.encoder, noise((seed, 2), self.encoder.noise_counts))
         self._assemble()
         self._latch()
-
-    @property
-    def declared(self) -> JointPlant:
-        """Its physics without the effects."""
-        return self._declared
 
     @property
     def time_s(self) -> float:
@@ -118,15 +113,15 @@ class World:
             SimError: a joint of another kind, or impossible values.
         """
         if plant is not None:
-            if (plant.arrangement, plant.rigid) != (self._declared.arrangement, self._declared.rigid):
-                raise SimError(f'alter: expected arrangement "{self._declared.arrangement}", as before')
-            self._declared = plant
+            if (plant.arrangement, plant.rigid) != (self.declared.arrangement, self.declared.rigid):
+                raise SimError(f'alter: expected arrangement "{self.declared.arrangement}", as before')
+            self.declared = plant
         if effects is not None:
             self._effects = tuple(effects)
         self._assemble()
 
     def _assemble(self) -> None:
-        assembly = assemble(self._declared, self._effects, self.plant_step_s)
+        assembly = assemble(self.declared, self._effects, self.plant_step_s)
         self.plant = assembly.joint()
         self._step = integrator(self.plant, self.plant_step_s)
         self._settle = settling(self.plant, self.plant_step_s)

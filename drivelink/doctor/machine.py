@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from drivelink.cycle.realtime import PRIORITY
 from drivelink.doctor.report import Section
 from drivelink.errors import ZenohError
 from drivelink.jointfile import BusSection, JointFile
@@ -28,10 +29,7 @@ def examine_machine(section: Section, period_s: float, seconds: float) -> None:
     kernel = platform.release()
     realtime = Path("/sys/kernel/realtime").exists() or "PREEMPT_RT" in platform.version()
     section.ok("kernel", f"Linux {kernel}" + (", PREEMPT_RT" if realtime else ""))
-    capabilities = _capabilities()
-    _scheduling(section, capabilities)
-    _memory(section, capabilities)
-    _files(section)
+    _rights(section, _capabilities())
     _governor(section)
     _timer(section, period_s, seconds)
 
@@ -43,47 +41,28 @@ def _capabilities() -> int:
     return 0
 
 
-def _scheduling(section: Section, capabilities: int) -> None:
-    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
-    if limit == resource.RLIM_INFINITY or limit >= 80 or capabilities >> _CAP_SYS_NICE & 1:
-        section.ok("real time", "SCHED_FIFO is allowed")
-    else:
-        section.warn(
-            "real time",
-            f"SCHED_FIFO is not allowed (limit {limit}, 80 is wanted): expect a larger jitter",
-            f"echo '{_user()} - rtprio 99' | sudo tee -a /etc/security/limits.d/drivelink.conf, "
-            "then log in again",
-        )
-
-
-def _memory(section: Section, capabilities: int) -> None:
-    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-    if limit == resource.RLIM_INFINITY or limit >= _NEEDED_LOCKED or capabilities >> _CAP_IPC_LOCK & 1:
-        section.ok("memory", "can be locked")
-    else:
-        section.warn(
-            "memory",
-            f"only {limit >> 10} KiB may be locked: a page fault may delay a cycle",
-            f"echo '{_user()} - memlock unlimited' | sudo tee -a /etc/security/limits.d/drivelink.conf, "
-            "then log in again",
-        )
-
-
-def _files(section: Section) -> None:
-    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    if limit == resource.RLIM_INFINITY or limit >= FILES:
-        section.ok("files", f"{FILES} may be open: connections that say nothing lock no subscriber out")
-    else:
-        section.warn(
-            "files",
-            f"only {limit} may be open, {FILES} are wanted: as many connections lock new subscribers out",
-            f"echo '{_user()} - nofile {FILES}' | sudo tee -a /etc/security/limits.d/drivelink.conf, "
-            "then log in again",
-        )
-
-
-def _user() -> str:
-    return os.environ.get("USER", "USER")
+def _rights(section: Section, capabilities: int) -> None:
+    """Examine what this user may do."""
+    real_time, locked = (resource.getrlimit(r)[0] for r in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK))
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    for subject, limit, least, instead, fine, lacking, line in (
+        ("real time", real_time, PRIORITY, _CAP_SYS_NICE, "SCHED_FIFO is allowed",
+         f"SCHED_FIFO is not allowed (limit {real_time}, {PRIORITY} is wanted): expect a larger jitter",
+         "rtprio 99"),
+        ("memory", locked, _NEEDED_LOCKED, _CAP_IPC_LOCK, "can be locked",
+         f"only {locked >> 10} KiB may be locked: a page fault may delay a cycle", "memlock unlimited"),
+        ("files", files, FILES, None,
+         f"{FILES} may be open: connections that say nothing lock no subscriber out",
+         f"only {files} may be open, {FILES} are wanted: as many connections lock new subscribers out",
+         f"nofile {FILES}"),
+    ):  # fmt: skip
+        has = instead is not None and capabilities >> instead & 1
+        if limit == resource.RLIM_INFINITY or limit >= least or has:
+            section.ok(subject, fine)
+        else:
+            user = os.environ.get("USER", "USER")
+            file = "/etc/security/limits.d/drivelink.conf"
+            section.warn(subject, lacking, f"echo '{user} - {line}' | sudo tee -a {file}, then log in again")
 
 
 def _governor(section: Section) -> None:

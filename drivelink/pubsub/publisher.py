@@ -73,7 +73,7 @@ class JointPublisher:
             self._estimate = self._stream("estimate", ESTIMATE.schema, zenoh.Priority.REAL_TIME)
             self._external = self._stream("external", EXTERNAL.schema, zenoh.Priority.REAL_TIME)
             self._sample = self._stream("sample", SAMPLE.schema, zenoh.Priority.INTERACTIVE_HIGH)
-            self._snapshot = self._background("snapshot")
+            self._snapshot = self._stream("snapshot", "", zenoh.Priority.BACKGROUND)
             self._latched = {name: self._latch(name) for name in DOCUMENTS}
             self._answer("schema", to_json(schema()))
             self.put_joint(joint)
@@ -175,22 +175,14 @@ class JointPublisher:
         self._entities.append(self._session.liveliness().declare_token(key))
 
     def _stream(self, name: str, schema_name: str, priority: zenoh.Priority) -> Stream:
+        background = priority == zenoh.Priority.BACKGROUND
+        plain, serialized = zenoh.Encoding.APPLICATION_OCTET_STREAM, zenoh.Encoding.ZENOH_SERIALIZED
         publisher = self._session.declare_publisher(
             f"{self.key}/{name}",
-            encoding=zenoh.Encoding.ZENOH_SERIALIZED.with_schema(schema_name),
-            congestion_control=self._congestion_control,
+            encoding=serialized.with_schema(schema_name) if schema_name else plain,
+            congestion_control=zenoh.CongestionControl.BLOCK if background else self._congestion_control,
             priority=priority,
-            express=self._express,
-        )
-        self._entities.append(publisher)
-        return Stream(publisher)
-
-    def _background(self, name: str) -> Stream:
-        publisher = self._session.declare_publisher(
-            f"{self.key}/{name}",
-            encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.BACKGROUND,
+            express=self._express and not background,
         )
         self._entities.append(publisher)
         return Stream(publisher)

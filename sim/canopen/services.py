@@ -127,9 +127,10 @@ class HeartbeatProducer:
         """Apply a changed period; the first heartbeat is one period from now."""
         self.stop()
         if self._period.number:
-            self._timer = self._node.timers.every(self._period.number * 1e-3, self._beat)
+            self._timer = self._node.timers.after(self._period.number * 1e-3, self._beat)
 
     def _beat(self) -> None:
+        self.restart()
         self._node.send(0x700 + self._node.node_id, bytes([self._node.state]))
 
 

@@ -13,9 +13,9 @@ class Timer:
 
     __slots__ = ("action", "due_s")
 
-    def __init__(self, due_s: float, action: Callable[[], None] | None) -> None:
+    def __init__(self, due_s: float, action: Callable[[], None]) -> None:
         self.due_s = due_s
-        self.action = action
+        self.action: Callable[[], None] | None = action
 
     def cancel(self) -> None:
         """Cancel the call."""
@@ -34,21 +34,6 @@ class Timers:
     def after(self, delay_s: float, action: Callable[[], None]) -> Timer:
         """Call `action` once, `delay_s` from now."""
         timer = Timer(self.now_s + delay_s, action)
-        heapq.heappush(self._heap, (timer.due_s, next(self._count), timer))
-        self.next_s = self._heap[0][0]
-        return timer
-
-    def every(self, period_s: float, action: Callable[[], None]) -> Timer:
-        """Call `action` at whole multiples of the period from now; missed ones are skipped."""
-        timer = Timer(self.now_s + period_s, None)
-
-        def fire() -> None:
-            missed = max(0, int((self.now_s - timer.due_s) / period_s))
-            timer.due_s += (1 + missed) * period_s
-            heapq.heappush(self._heap, (timer.due_s, next(self._count), timer))
-            action()
-
-        timer.action = fire
         heapq.heappush(self._heap, (timer.due_s, next(self._count), timer))
         self.next_s = self._heap[0][0]
         return timer

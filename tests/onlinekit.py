@@ -5,8 +5,10 @@ Everything goes through the public interface, `make_estimator(...).step`, so it 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +20,7 @@ from estimator import make_estimator as make_estimator
 from sim.cases import case
 from sim.effects import PlantEffect
 from sim.plant import JointPlant, Spring
-from sim.world import record
+from sim.world import World, record
 
 VALID, OBSERVABLE, NODE_RESTARTED = int(Status.VALID), int(Status.OBSERVABLE), int(Status.NODE_RESTARTED)
 PERIOD_S = 0.001
@@ -74,6 +76,51 @@ def motion(
         effects: physics that the case does not have.
         step: (time, factor) of a change of the stiffness.
     """
+    if excitation is None and not effects and step is None:
+        return _begun(name, seed, bits, noise).first(seconds)
+    world = _world(name, seed, excitation, bits, noise, effects)
+    if step is None:
+        return _moved(record(world, seconds))
+    before = record(world, step[0])
+    world.advance()
+    world.alter(plant=_stiffer(case(name).plant, step[1]))
+    after = record(world, seconds - step[0])
+    return _moved({name: np.concatenate([before[name], after[name]]) for name in before})
+
+
+class _Begun:
+    """A motion that is simulated on as far as a test asks for it."""
+
+    def __init__(self, world: World) -> None:
+        self.world, self.motion = world, Motion([], np.empty(0), np.empty(0))
+
+    def first(self, seconds: float) -> Motion:
+        samples, *columns = self.motion
+        more = round(seconds / PERIOD_S) - len(samples)
+        if more > 0:
+            if samples:
+                self.world.advance()
+            found, *others = _moved(record(self.world, more * PERIOD_S))
+            samples = samples + [s._replace(sequence=k) for k, s in enumerate(found, len(samples))]
+            columns = [np.concatenate(pair) for pair in zip(columns, others, strict=True)]
+            self.motion = Motion(samples, *columns)
+        n = round(seconds / PERIOD_S)
+        return Motion(samples[:n], *(column[:n].copy() for column in columns))
+
+
+@cache
+def _begun(name: str, seed: int, bits: int | None, noise: bool) -> _Begun:
+    return _Begun(_world(name, seed, None, bits, noise, ()))
+
+
+def _world(
+    name: str,
+    seed: int,
+    excitation: Mapping[str, Any] | None,
+    bits: int | None,
+    noise: bool,
+    effects: Sequence[PlantEffect],
+) -> World:
     given = case(name)
     drives, encoder = given.drives, given.encoder
     if bits is not None:
@@ -82,20 +129,17 @@ def motion(
     if not noise:
         drives = tuple(replace(d, current_noise_a=0.0, current_resolution_a=1e-9) for d in drives)
     rich = given.rich if excitation is None else excitation
-    world = replace(given, drives=drives, encoder=encoder).world(excitation=rich, effects=effects, seed=seed)
-    if step is None:
-        rows = record(world, seconds)
-    else:
-        before = record(world, step[0])
-        world.advance()
-        world.alter(plant=_stiffer(given.plant, step[1]))
-        after = record(world, seconds - step[0])
-        rows = {name: np.concatenate([before[name], after[name]]) for name in before}
+    return replace(given, drives=drives, encoder=encoder).world(excitation=rich, effects=effects, seed=seed)
+
+
+def _moved(rows: Mapping[str, np.ndarray]) -> Motion:
+    """The columns as samples, with the truth beside them."""
+    motors = [
+        name.removesuffix("_position_rad") for name in rows if re.fullmatch("motor._position_rad", name)
+    ]
 
     def stacked(quantity: str) -> list[tuple[float, ...]]:
-        return list(
-            zip(*(rows[f"motor{i}_{quantity}"].tolist() for i in range(1, len(drives) + 1)), strict=True)
-        )
+        return list(zip(*(rows[f"{motor}_{quantity}"].tolist() for motor in motors), strict=True))
 
     columns = map(stacked, ("position_rad", "velocity_rad_s", "torque_nm"))
     together = zip(*columns, rows["link_position_rad"].tolist(), strict=True)

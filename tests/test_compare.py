@@ -27,14 +27,14 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, (effects, parameters) in kinds.items():
         world = world_from_joint(jointfile.load(ELBOW))
         alter(world, effects, parameters)
-        columns = record(world, 5.0)
+        columns = record(world, 4.0)
         rows = np.column_stack([columns[column] for column in COLUMNS])
         np.savetxt(folder / f"{name}.csv", rows, "%.17g", ",", header=",".join(COLUMNS), comments="")
     return folder
 
 
 def test_two_machines_differ_in_the_stiffness_and_each_model_fits_its_own(runs):
-    made = compare(runs / "healthy.csv", runs / "soft.csv", ELBOW, horizon_s=2.0)
+    made = compare(runs / "healthy.csv", runs / "soft.csv", ELBOW, horizon_s=1.0)
     stiffness, friction = made.differences()
     assert abs(stiffness.b / stiffness.a - 0.9) < 0.02
     assert abs(stiffness.b - stiffness.a) > 10.0 * stiffness.std > 0.0

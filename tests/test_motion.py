@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from drivelink import cli, jointfile
 from drivelink.demo.simulate import alter, world_from_joint
@@ -29,15 +30,15 @@ def limits():
     )
 
 
-def written(folder, excitation, name="run.csv"):
-    """The elbow with backlash, moved so, and its recording of 12 s."""
+def written(folder, excitation, name="run.csv", seconds=8.0):
+    """The elbow with backlash, moved so, and its recording."""
     joint = folder / "elbow.toml"
     text = ELBOW.read_text(encoding="utf-8")
     assert text.count('{ kind = "rich" }') == 1
     joint.write_text(text.replace('{ kind = "rich" }', excitation) + "\n" + MOTION)
     world = world_from_joint(jointfile.load(joint), file=joint)
     alter(world, ["backlash=0.003"], {})
-    columns = record(world, 12.0)
+    columns = record(world, seconds)
     rows = np.column_stack([columns[column] for column in COLUMNS])
     np.savetxt(folder / name, rows, "%.9g", ",", header=",".join(COLUMNS), comments="")
     return joint, folder / name
@@ -72,6 +73,7 @@ def test_what_a_driven_model_reads_its_free_run_gives_back():
             assert min(free_run(run, changed, 1.0).fit_percent.values()) > 97.0
 
 
+@pytest.mark.slow
 def test_a_designed_motion_is_written_played_and_decides(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(motion, "_POPULATION", 5)
     monkeypatch.setattr(motion, "_GENERATIONS", 1)
@@ -101,7 +103,7 @@ def test_a_designed_motion_is_written_played_and_decides(tmp_path, capsys, monke
 
 
 def test_what_is_wrong_is_one_line(tmp_path, capsys):
-    joint, _ = written(tmp_path, '{ kind = "none" }')
+    joint, _ = written(tmp_path, '{ kind = "none" }', seconds=1.0)
     asked = ["diagnose", str(tmp_path / "run.csv"), "--joint", str(joint)]
     assert cli.main([*asked, "--motion", "next.txt"]) == 2
     assert cli.main([*asked, "--motion", "next.csv", "--motion-seconds", "1"]) == 2

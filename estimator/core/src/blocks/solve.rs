@@ -3,14 +3,17 @@
 use super::{Blocks, FEWEST, REACHED};
 use crate::balance;
 use crate::gram::{
-    Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, by_prior, choose, cluster, dot, log_evidence,
+    COLUMNS, Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, by_prior, choose, cluster, dot, log_evidence,
     set, solve, unknowns,
 };
+use crate::laws::{Law, PARAMETERS};
 use crate::spring::{MARGIN, Projection};
 use crate::student::t_95;
 use crate::unknowns::{ACTIVE, CANDIDATES, DRY, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO};
 
 const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
+const WIDE: f64 = 1e6; // of a prior that says nothing
+const SURE: f64 = 3.0; // standard deviations of a compliance that is one
 const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
 const EXACT: f64 = 3e-4; // of the torque: what filters, sampling and rounding leave of a true model
 const ALIKE: f64 = 0.3; // share of what a missing effect does to a block that it does to all: 0 is noise, 1 one motion again and again
@@ -59,6 +62,32 @@ impl Blocks {
             }
         }
         self.spring.known |= best.is_some();
+    }
+
+    /// Start a polynomial of which nothing is known with the stiffness that explains the deflection, a late link beside it.
+    ///
+    /// φ = (B θ″ + D θ′ + friction + offset − τ) / K − late q′. Where a stiff joint moves fast the deflection is mostly
+    /// delay: the balance solved for the torque would have nearly no spring, and a delay is nothing without one.
+    fn start_by_deflection(&mut self, total: &Gram) {
+        let mut frame =
+            Frame { left: [0.0; COLUMNS], directions: [[0.0; COLUMNS]; UNKNOWNS], set: set(1..5) };
+        frame.left[balance::SPRING.start] = -self.deflection;
+        frame.directions[1][balance::TORQUE] = -1.0;
+        frame.directions[1][balance::ACCELERATION] = self.motor.inertia;
+        frame.directions[1][balance::VELOCITY] = self.motor.damping;
+        for (i, column) in (2..).zip([balance::LATE.start, balance::OFFSET, balance::DRY]) {
+            frame.directions[i][column] = 1.0;
+        }
+        let reduced = frame.reduce(total);
+        let wide = std::array::from_fn(|i| WIDE * (reduced[0][0] / reduced[i][i].max(f64::MIN_POSITIVE)).sqrt());
+        let prior = Prior::independent([0.0; UNKNOWNS], &wide);
+        let Some(rough) = solve(&reduced, frame.set, &prior, reduced[0][0]) else { return };
+        let left = total.quadratic(&frame.residual(&rough.x, rough.set)) / total.rows;
+        let Some(found) = solve(&reduced, frame.set, &prior, left * self.correlated) else { return };
+        if found.x[1] > SURE * found.covariance[1][1].sqrt() {
+            self.spring.alpha = [0.0; PARAMETERS];
+            self.spring.alpha[0] = found.x[1].recip();
+        }
     }
 
     /// Where a lost zero is by evidence: linearised in steps over the deflections that the joint has had; `None`: all that
@@ -123,6 +152,10 @@ impl Blocks {
             && (!self.spring.known || self.ring.len() <= FEWEST && self.carried.is_none())
         {
             self.start(&total, self.noise.variance * self.correlated);
+        }
+        let fresh = self.ring.len() <= FEWEST && self.carried.is_none() && !self.spring.is_anchored();
+        if fresh && matches!(self.spring.law, Law::Polynomial | Law::Linear) {
+            self.start_by_deflection(&total);
         }
         if !self.is_located(&total) {
             return;
@@ -321,7 +354,6 @@ impl Blocks {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::laws::Law;
     use crate::model::{Motor, Transmission};
     use crate::settings::Priors;
 

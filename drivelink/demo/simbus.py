@@ -207,25 +207,22 @@ class SocketcandServer(can.BusABC):
 
     def _flush(self, client: _Client) -> None:
         with self._writing:
-            self._send_unsent(client)
-
-    def _send_unsent(self, client: _Client) -> None:
-        if client not in self._clients:  # the other thread has just dropped it
-            return
-        try:
-            sent = client.socket.send(client.unsent)
-            del client.unsent[:sent]
-        except BlockingIOError:
-            pass
-        except OSError:
-            self._drop(client)
-            return
-        if len(client.unsent) > _LARGEST_BACKLOG:
-            self._drop(client)
-            return
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.unsent else 0)
-        if self._selector.get_key(client.socket).events != wanted:
-            self._selector.modify(client.socket, wanted, client)
+            if client not in self._clients:  # the other thread has just dropped it
+                return
+            try:
+                sent = client.socket.send(client.unsent)
+                del client.unsent[:sent]
+            except BlockingIOError:
+                pass
+            except OSError:
+                self._drop(client)
+                return
+            if len(client.unsent) > _LARGEST_BACKLOG:
+                self._drop(client)
+                return
+            wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.unsent else 0)
+            if self._selector.get_key(client.socket).events != wanted:
+                self._selector.modify(client.socket, wanted, client)
 
 
 def _frame(message: can.Message, stamp_s: float) -> bytes:

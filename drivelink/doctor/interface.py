@@ -16,8 +16,7 @@ _GOOD_QUEUE = 100  # frames; the kernel's default of 10 is full with two cycles 
 
 def can_interfaces() -> list[str]:
     """Return SocketCAN interfaces of this machine."""
-    links = _links("-details")
-    return [link["ifname"] for link in links if link.get("link_type") == "can"]
+    return [name for name, link in _links().items() if link.get("link_type") == "can"]
 
 
 def examine_interface(section: Section, bus: BusSection) -> None:
@@ -36,8 +35,8 @@ def examine_interface(section: Section, bus: BusSection) -> None:
     if shutil.which("ip") is None:
         section.warn(bus.channel, "`ip` is missing: state unknown", "sudo apt install iproute2")
         return
-    links = _links("-details", "-statistics", "dev", bus.channel)
-    if not links:
+    link = _links().get(bus.channel)
+    if link is None:
         known = can_interfaces()
         section.error(
             bus.channel,
@@ -47,18 +46,18 @@ def examine_interface(section: Section, bus: BusSection) -> None:
             else "plug it in, load its driver, or correct bus.channel",
         )
         return
-    judge_link(section, links[0], bus)
+    judge_link(section, link, bus)
 
 
-def _links(*arguments: str) -> list[dict[str, Any]]:
-    command = ["ip", "-json", *[a for a in arguments if a.startswith("-")], "link", "show"]
-    command += [a for a in arguments if not a.startswith("-")]
+def _links() -> dict[str, dict[str, Any]]:
+    """The system's network interfaces, by name."""
+    command = ["ip", "-json", "-details", "-statistics", "link", "show"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
         links = json.loads(done.stdout or "[]")
     except (OSError, subprocess.TimeoutExpired, json.JSONDecodeError):
-        return []
-    return [link for link in links if link]
+        return {}
+    return {link["ifname"]: link for link in links if link}
 
 
 def judge_link(section: Section, link: dict[str, Any], bus: BusSection) -> None:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Mapping
+import io
+from collections.abc import Iterable, Mapping
+from configparser import RawConfigParser
 from copy import copy
 from functools import cache
 from pathlib import Path
 
-from canopen.objectdictionary import ODArray, ODRecord, ODVariable, import_od
+from canopen.objectdictionary import ODVariable, import_od
 
 from sim.canopen.dictionary import Object, variables
 from sim.canopen.node import Node
-
-_CODES: dict[type, int] = {ODVariable: 0x7, ODArray: 0x8, ODRecord: 0x9}  # CiA 301, table 42
 
 
 def eds_directory() -> Path:
@@ -50,46 +49,30 @@ def with_members(described: Object, members: Iterable[ODVariable]) -> Object:
 
 
 def node_eds(file_name: str, node: Node) -> str:
-    """Return the EDS file of a device, with its present power-on values."""
-    shipped = (eds_directory() / f"{node.quirks.eds}.eds").read_text(encoding="ascii")
-    head = shipped.partition("\n[1000]\n")[0]
+    """Return the EDS file of a device: the shipped one, with its present power-on values and sensors."""
+    eds = RawConfigParser()
+    eds.optionxform = str  # type: ignore[assignment, method-assign]
+    eds.read(eds_directory() / f"{node.quirks.eds}.eds", encoding="ascii")
     objects = node.dictionary.objects
-    name = _default(variables(objects[0x1008])[0])
-    for key, value in (
-        ("FileName", file_name),
-        ("Description", name),
-        ("ProductName", name),
-        ("ProductNumber", str(variables(objects[0x1018])[2].default)),
-        ("OrderCode", node.quirks.name),
-    ):
-        head = re.sub(f"^{key}=.*$", f"{key}={value}", head, flags=re.MULTILINE)
-    return "\n".join([head, *(line for described in objects.values() for line in _object(described))])
-
-
-def _object(described: Object) -> Iterator[str]:
-    section = f"{described.index:04X}"
-    if isinstance(described, ODVariable):
-        yield from (f"[{section}]", *_item(described), "")
-        return
-    members = variables(described)
-    yield from (
-        f"[{section}]",
-        f"ParameterName={described.name}",
-        f"ObjectType=0x{_CODES[type(described)]:X}",
-    )
-    yield from (f"SubNumber={len(members)}", "")
-    for item in members:
-        yield from (f"[{section}sub{item.subindex:X}]", *_item(item), "")
-
-
-def _item(item: ODVariable) -> Iterator[str]:
-    yield from (f"ParameterName={item.name}", f"ObjectType=0x{_CODES[ODVariable]:X}")
-    yield from (f"DataType=0x{item.data_type:04X}", f"AccessType={item.access_type}")
-    yield from (f"DefaultValue={_default(item)}", f"PDOMapping={int(item.pdo_mappable)}")
-    if item.min is not None:
-        yield f"LowLimit={item.min}"
-    if item.max is not None:
-        yield f"HighLimit={item.max}"
+    name, product = _default(variables(objects[0x1008])[0]), variables(objects[0x1018])[2].default
+    eds["FileInfo"].update(FileName=file_name, Description=name)
+    eds["DeviceInfo"].update(ProductName=name, ProductNumber=str(product), OrderCode=node.quirks.name)
+    for described in objects.values():
+        section, members = f"{described.index:04X}", variables(described)
+        if isinstance(described, ODVariable):
+            eds[section]["DefaultValue"] = _default(described)
+            continue
+        eds[section]["SubNumber"] = str(len(members))
+        first, places = dict(eds[f"{section}sub1"]), [f"{section}sub{item.subindex:X}" for item in members]
+        for place in eds.sections():
+            if place.startswith(f"{section}sub") and place not in places:
+                eds.remove_section(place)
+        for place, item in zip(places, members, strict=True):
+            text = eds[place] if eds.has_section(place) else first
+            eds[place] = {**text, "ParameterName": item.name, "DefaultValue": _default(item)}
+    written = io.StringIO()
+    eds.write(written, space_around_delimiters=False)
+    return written.getvalue().rstrip("\n") + "\n"
 
 
 def _default(item: ODVariable) -> str:

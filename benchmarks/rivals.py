@@ -20,7 +20,6 @@ from drivelink.cycle.realtime import Alarm
 from drivelink.cycle.sources import open_source
 from drivelink.jointfile import JointFile
 from estimator.sample import Estimate, TransmissionEstimate
-from sim.canopen.edsfile import node_eds
 from sim.canopen.node import Node
 
 _ENCODING = {
@@ -91,7 +90,7 @@ class Textbook:
         self._layouts = layouts
         self._arrived: set[int] = set()
         for device in devices:
-            eds = io.StringIO(node_eds("node.eds", device))
+            eds = io.StringIO(device.eds("node.eds"))
             eds.name = "node.eds"
             node = self._network.add_node(device.node_id, canopen.import_od(eds, device.node_id))
             self._map(node, layouts[device.node_id])

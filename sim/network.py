@@ -17,7 +17,6 @@ from pathlib import Path
 import can
 
 from sim.canopen.drive import Cia402Drive
-from sim.canopen.edsfile import node_eds
 from sim.canopen.node import Node
 from sim.errors import SimError
 from sim.world import World
@@ -342,4 +341,4 @@ class Bench:
         for name, group in self._groups:
             for node in group:
                 file = f"{name}-node{node.node_id}.eds"
-                (directory / file).write_text(node_eds(file, node), encoding="ascii")
+                (directory / file).write_text(node.eds(file), encoding="ascii")

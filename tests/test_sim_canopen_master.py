@@ -14,7 +14,7 @@ from simkit import StubRig
 
 from drivelink.canopen.bus import interface_is_up
 from sim.canopen.drive import Cia402Drive
-from sim.canopen.edsfile import eds_directory, node_eds
+from sim.canopen.edsfile import eds_directory
 from sim.canopen.encoder import Cia406Encoder
 from sim.canopen.profiles import PROFILES, profile
 from sim.network import Network
@@ -84,7 +84,7 @@ EDS = {
 def test_every_object_of_the_eds_is_served_with_its_type_and_default(eds):
     rig, served = StubRig(), set()
     node = device(eds, rig)
-    assert node_eds(eds, node) == (eds_directory() / eds).read_text(encoding="ascii")
+    assert node.eds(eds) == (eds_directory() / eds).read_text(encoding="ascii")
     assert {path.name for path in eds_directory().glob("*.eds")} == set(EDS)
     with mastered(node, rig=rig) as master:
         peer = remote(master, eds)
@@ -106,10 +106,10 @@ def test_every_object_of_the_eds_is_served_with_its_type_and_default(eds):
 def test_an_eds_file_has_the_nameplate_of_its_device():
     rig = StubRig(DriveHardware(counts_per_rev=8192, gear_ratio=50 / 3))
     node = Cia402Drive(1, rig, 0, replace(profile("epos4"), second_encoder=3), link_encoder=True)
-    text = node_eds("elbow.eds", node)
+    text = node.eds("elbow.eds")
     assert "FileName=elbow.eds" in text and "ProductName=drivelink simulated drive, EPOS4-like" in text
     assert "[60E4sub3]\nParameterName=Additional position actual value, sensor 3" in text
-    strict = node_eds("elbow.eds", Cia402Drive(1, rig, 0))
+    strict = Cia402Drive(1, rig, 0).eds("elbow.eds")
     assert "[608Fsub1]" in strict and "DefaultValue=0x2000" in strict.split("[608Fsub1]")[1][:160]
 
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Mapping
-from copy import copy
+from collections.abc import Callable
 from enum import IntEnum
 from fractions import Fraction
 
-from sim.canopen.dictionary import Abort, Entry, Object, SdoAbortedError, variables
-from sim.canopen.edsfile import load_eds, with_members, with_values
+from sim.canopen.dictionary import Abort, Entry, SdoAbortedError
+from sim.canopen.edsfile import data_sheet
 from sim.canopen.node import Nmt, Node
 from sim.canopen.profiles import Quirks
 from sim.sensors import DriveHardware, DriveSignals
@@ -102,7 +100,6 @@ _TOGGLE = 0x0400
 _FAULT_SIGNAL, _DISABLE_VOLTAGE, _QUICK_STOP = 1, 2, 3  # 0x6007
 _HEARTBEAT_LOST = 0x8130
 _POSITION_REVERSED, _VELOCITY_REVERSED = 0x80, 0x40
-_SENSORS = (0x60E4, 0x60E5, 0x60E6, 0x60EB)  # arrays with an entry per encoder
 
 # 0x60A9: units of a numerator per radian, and seconds in a denominator.
 _RADIAN, _DEGREE, _REVOLUTION, _INCREMENT = 0x10, 0x41, 0xB4, 0xB5
@@ -122,29 +119,6 @@ def _nameplate(drive: DriveHardware) -> dict[tuple[int, int], int]:
         (0x6091, 2): gear.denominator,
         (0x6092, 1): counts * gear.numerator // gear.denominator,
     }
-
-
-def _drive_objects(plate: Mapping[tuple[int, int], int], link_counts: int, quirks: Quirks) -> list[Object]:
-    """The dictionary of a drive, by its EDS file and nameplate; `link_counts` 0: no second encoder."""
-    second = quirks.second_encoder
-    objects = [_with_sensors(one, second) if one.index in _SENSORS else one for one in load_eds(quirks.eds)]
-    values: dict[tuple[int, int], int | str] = {
-        (0x60E6, second): link_counts,
-        (0x60EB, second): 1,
-    }
-    if quirks.identity is not None:
-        values |= {(0x1008, 0): quirks.identity[0], (0x1018, 2): quirks.identity[1]}
-    return with_values(objects, {**plate, **values})
-
-
-def _with_sensors(described: Object, count: int) -> Object:
-    """An array of the second encoder's values with so many sensors, all zero."""
-    highest, first = map(copy, variables(described)[:2])
-    highest.default = count
-    sensors = [copy(first) for _ in range(count)]
-    for k, sensor in enumerate(sensors, start=1):
-        sensor.subindex, sensor.name, sensor.default = k, re.sub(r"\d+$", str(k), first.name), 0
-    return with_members(described, [highest, *sensors])
 
 
 def _limited(value: float, bound: int) -> int:
@@ -169,10 +143,17 @@ class Cia402Drive(Node):
     ) -> None:
         self._rig, self._motor, self._wired = rig, motor, link_encoder
         quirks, plate = quirks or Quirks(), _nameplate(rig.drives[motor])
-        link_counts = round(rig.encoder.counts_per_rev) if link_encoder else 0
+        second = quirks.second_encoder
+        values: dict[tuple[int, int], int | str] = {
+            **plate,
+            (0x60E6, second): round(rig.encoder.counts_per_rev) if link_encoder else 0,
+            (0x60EB, second): 1,
+        }
+        if quirks.identity is not None:
+            values |= {(0x1008, 0): quirks.identity[0], (0x1018, 2): quirks.identity[1]}
         self._counts_per_rev = plate[0x608F, 1]
         self._sampled: tuple[Callable[[DriveSignals], None], ...] = ()
-        super().__init__(node_id, _drive_objects(plate, link_counts, quirks), quirks)
+        super().__init__(node_id, data_sheet(quirks.eds, frozenset(values.items()), second), quirks)
         self.machine = StateMachine()
         self._torque_unit_nm = plate[0x6076, 0] * 1e-6
         self._current_unit_a = plate[0x6075, 0] * 1e-6

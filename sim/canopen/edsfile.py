@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping
+import re
 from configparser import RawConfigParser
-from copy import copy
 from functools import cache
 from pathlib import Path
 
-from canopen.objectdictionary import ODVariable, import_od
+from canopen.objectdictionary.eds import import_eds
 
-from sim.canopen.dictionary import Object, variables
-from sim.canopen.node import Node
+from sim.canopen.dictionary import Object
+
+Value = tuple[tuple[int, int], int | str]
+"""(index, subindex) and the power-on value."""
+
+_SENSORS = ("60E4", "60E5", "60E6", "60EB")  # arrays with an entry per encoder
 
 
 def eds_directory() -> Path:
@@ -21,63 +24,62 @@ def eds_directory() -> Path:
 
 
 @cache
-def load_eds(name: str) -> tuple[Object, ...]:
-    """Return the objects of a shipped EDS file, by index."""
-    dictionary = import_od(str(eds_directory() / f"{name}.eds"), 0)
+def data_sheet(name: str, values: frozenset[Value], sensors: int = 0) -> str:
+    """Return a shipped EDS file with other power-on values; those of missing objects are ignored.
+
+    Args:
+        sensors: how many encoders its arrays are for; 0: as shipped.
+    """
+    eds = _parsed((eds_directory() / f"{name}.eds").read_text(encoding="ascii"))
+    for section in _SENSORS if sensors else ():
+        if eds.has_section(section):
+            _resize(eds, section, sensors)
+    for (index, subindex), value in values:
+        places = (f"{index:04X}sub{subindex:X}", *([] if subindex else [f"{index:04X}"]))
+        for place in filter(eds.has_section, places):
+            eds[place]["DefaultValue"] = (
+                f"0x{value:X}" if isinstance(value, int) and value >= 10 else str(value)
+            )
+            break
+    return _written(eds)
+
+
+@cache
+def objects_of(sheet: str) -> tuple[Object, ...]:
+    """Return the objects of an EDS file's text, by index."""
+    dictionary = import_eds(io.StringIO(sheet), 0)  # type: ignore[no-untyped-call]
     return tuple(dictionary[index] for index in sorted(dictionary) if index >= 0x1000)
 
 
-def with_values(objects: Iterable[Object], values: Mapping[tuple[int, int], int | str]) -> list[Object]:
-    """Return copies with other power-on values, by (index, subindex); missing objects are ignored."""
-
-    def changed(variable: ODVariable) -> ODVariable:
-        made = copy(variable)
-        made.default = values.get((made.index, made.subindex), made.default)  # type: ignore[assignment]
-        return made
-
-    return [with_members(one, map(changed, variables(one))) for one in objects]
+def with_head(sheet: str, file_name: str, name: str, product: int, order_code: str) -> str:
+    """Return an EDS file's text with another name and number of the device."""
+    eds = _parsed(sheet)
+    eds["FileInfo"].update(FileName=file_name, Description=name)
+    eds["DeviceInfo"].update(ProductName=name, ProductNumber=str(product), OrderCode=order_code)
+    return _written(eds)
 
 
-def with_members(described: Object, members: Iterable[ODVariable]) -> Object:
-    """Return an object like this one with other sub-indices."""
-    if isinstance(described, ODVariable):
-        return next(iter(members))
-    made = type(described)(described.name, described.index)
-    for member in members:
-        made.add_member(member)
-    return made
+def _resize(eds: RawConfigParser, section: str, count: int) -> None:
+    """Give an array so many sensors, all zero."""
+    first = dict(eds[f"{section}sub1"])
+    for place in eds.sections():
+        if place.startswith(f"{section}sub") and int(place[7:], 16) > count:
+            eds.remove_section(place)
+    eds[section]["SubNumber"] = str(count + 1)
+    eds[f"{section}sub0"]["DefaultValue"] = str(count)
+    for k in range(1, count + 1):
+        name = re.sub(r"\d+$", str(k), first["ParameterName"])
+        eds[f"{section}sub{k:X}"] = {**first, "ParameterName": name, "DefaultValue": "0"}
 
 
-def node_eds(file_name: str, node: Node) -> str:
-    """Return the EDS file of a device: the shipped one, with its present power-on values and sensors."""
+def _parsed(text: str) -> RawConfigParser:
     eds = RawConfigParser()
     eds.optionxform = str  # type: ignore[assignment, method-assign]
-    eds.read(eds_directory() / f"{node.quirks.eds}.eds", encoding="ascii")
-    objects = node.dictionary.objects
-    name, product = _default(variables(objects[0x1008])[0]), variables(objects[0x1018])[2].default
-    eds["FileInfo"].update(FileName=file_name, Description=name)
-    eds["DeviceInfo"].update(ProductName=name, ProductNumber=str(product), OrderCode=node.quirks.name)
-    for described in objects.values():
-        section, members = f"{described.index:04X}", variables(described)
-        if isinstance(described, ODVariable):
-            eds[section]["DefaultValue"] = _default(described)
-            continue
-        eds[section]["SubNumber"] = str(len(members))
-        first, places = dict(eds[f"{section}sub1"]), [f"{section}sub{item.subindex:X}" for item in members]
-        for place in eds.sections():
-            if place.startswith(f"{section}sub") and place not in places:
-                eds.remove_section(place)
-        for place, item in zip(places, members, strict=True):
-            text = eds[place] if eds.has_section(place) else first
-            eds[place] = {**text, "ParameterName": item.name, "DefaultValue": _default(item)}
-    written = io.StringIO()
-    eds.write(written, space_around_delimiters=False)
-    return written.getvalue().rstrip("\n") + "\n"
+    eds.read_string(text)
+    return eds
 
 
-def _default(item: ODVariable) -> str:
-    default: int | str = item.default or 0
-    if isinstance(default, str):
-        return default
-    text = f"0x{default:X}" if default >= 10 else str(default)
-    return f"$NODEID+{text}" if item.relative else text
+def _written(eds: RawConfigParser) -> str:
+    text = io.StringIO()
+    eds.write(text, space_around_delimiters=False)
+    return text.getvalue().rstrip("\n") + "\n"

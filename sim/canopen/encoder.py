@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from sim.canopen.dictionary import Abort, SdoAbortedError
-from sim.canopen.edsfile import load_eds, with_values
+from sim.canopen.edsfile import data_sheet
 from sim.canopen.node import Node
 from sim.canopen.profiles import Quirks
 from sim.world import World
@@ -30,14 +30,14 @@ class Cia406Encoder(Node):
     ) -> None:
         self._scale, self._range_counts = scale, range_counts
         self._counts_per_rev = counts = round(scale.encoder.counts_per_rev)
-        plate = {
+        plate: dict[tuple[int, int], int | str] = {
             (0x6001, 0): counts,
             (0x6002, 0): min(0xFFFF_FFFF, range_counts),
             (0x6501, 0): counts,
             (0x6502, 0): min(0xFFFF, max(1, range_counts // counts)),
         }
         quirks = replace(quirks or Quirks(), eds="cia406-encoder")
-        super().__init__(node_id, with_values(load_eds(quirks.eds), plate), quirks)
+        super().__init__(node_id, data_sheet(quirks.eds, frozenset(plate.items())), quirks)
         find = self.dictionary.find
         self._position, self._speed = find(0x6004, 0), find(0x6030, 1)
         self._offset, self._preset = find(0x6509, 0), find(0x6003, 0)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from enum import IntEnum
 
-from sim.canopen.dictionary import Abort, Dictionary, Entry, Object, SdoAbortedError
+from sim.canopen.dictionary import Abort, Dictionary, Entry, SdoAbortedError
+from sim.canopen.edsfile import objects_of, with_head
 from sim.canopen.pdo import COB_INVALID, Rpdo, Tpdo, restricted
 from sim.canopen.profiles import Quirks
 from sim.canopen.sdo import SdoServer
@@ -43,12 +44,13 @@ class Node:
     # whether changed process data trigger types 254 and 255; if not, only the event timer does
     sends_on_change = True
 
-    def __init__(self, node_id: int, objects: Iterable[Object], quirks: Quirks) -> None:
+    def __init__(self, node_id: int, sheet: str, quirks: Quirks) -> None:
         if not 1 <= node_id <= 127:
             raise ValueError(f"node_id: expected 1 to 127, got {node_id}")
         self.node_id = node_id  # 1 to 127
         self.quirks = quirks
-        self.dictionary = Dictionary(objects, node_id)  # live values
+        self.sheet = sheet  # its EDS file's text
+        self.dictionary = Dictionary(objects_of(sheet), node_id)  # live values
         self.timers = Timers()  # its appointments; the network moves their clock
         self.state = Nmt.INITIALISING  # NMT state
         self.sync_id = 0x80  # identifier of the SYNC it listens to
@@ -69,6 +71,11 @@ class Node:
         """Connect to a network: how to send, and whom to notify of changed routes."""
         self._put = put
         self._rerouted = rerouted
+
+    def eds(self, file_name: str) -> str:
+        """Return the text of its EDS file."""
+        name, product = (self.dictionary.find(*address).default for address in ((0x1008, 0), (0x1018, 2)))
+        return with_head(self.sheet, file_name, bytes(name).decode(), int(product), self.quirks.name)
 
     def send(self, can_id: int, data: bytes) -> None:
         """Put a frame on the bus."""

@@ -1,5 +1,22 @@
 """The simulated world's exceptions: one root, raised when a world is built, never while it runs."""
 
+from __future__ import annotations
+
+import math
+from numbers import Real
+
 
 class SimError(ValueError):
     """What was wrong, where, and what was expected, in one line."""
+
+
+def require(name: str, value: object, *, positive: bool) -> float:
+    """Return a value that is finite and > 0, or >= 0.
+
+    Raises:
+        SimError: it is not.
+    """
+    number = float(value) if isinstance(value, Real) else math.nan
+    if not (math.isfinite(number) and (number > 0.0 if positive else number >= 0.0)):
+        raise SimError(f"{name}: expected a finite number {'> 0' if positive else '>= 0'}, got {value!r}")
+    return number

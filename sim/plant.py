@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from sim.errors import SimError
+from sim.errors import SimError, require
 
 Scalar = Callable[[float], float]
 Parameters = Mapping[str, float | tuple[float, ...]]
@@ -63,16 +63,9 @@ class Spring:
         return build(self.parameters)
 
 
-def _positive(parameters: Parameters, name: str) -> float:
-    value = parameters[name]
-    if isinstance(value, tuple | list) or not (math.isfinite(value) and value > 0.0):
-        raise SimError(f"{name}: expected a finite number > 0, got {value!r}")
-    return float(value)
-
-
 def _linear(parameters: Parameters) -> Law:
     """tau_e = k phi."""
-    k = _positive(parameters, "k_nm_rad")
+    k = require("k_nm_rad", parameters["k_nm_rad"], positive=True)
     return Law(lambda phi: k * phi, lambda phi: k, lambda phi: 0.5 * k * phi * phi)
 
 
@@ -112,8 +105,8 @@ def _vsa_ii(parameters: Parameters) -> Law:
     The four-bar linkage is fully stretched at C sin(phi/2) = 1. From 99.5 % of that angle on the law
     continues as a straight line, so that torques stay finite.
     """
-    k = _positive(parameters, "k_nm_rad")
-    c = _positive(parameters, "c")
+    k = require("k_nm_rad", parameters["k_nm_rad"], positive=True)
+    c = require("c", parameters["c"], positive=True)
     if c <= 1.0:
         raise SimError(f"c: expected a number > 1 (eq 20), got {c!r}")
     sin, cos, asin, sqrt = math.sin, math.cos, math.asin, math.sqrt
@@ -151,8 +144,8 @@ def _vsa_ii(parameters: Parameters) -> Law:
 
 def _exponential(parameters: Parameters) -> Law:
     """tau_e = sign(phi) (k/b) (exp(b |phi|) - 1): a stiffness that grows with the torque, k + b |tau_e|."""
-    k = _positive(parameters, "k_nm_rad")
-    b = _positive(parameters, "b_per_rad")
+    k = require("k_nm_rad", parameters["k_nm_rad"], positive=True)
+    b = require("b_per_rad", parameters["b_per_rad"], positive=True)
     gain, expm1, exp, copysign = k / b, math.expm1, math.exp, math.copysign
     return Law(
         lambda phi: copysign(gain * expm1(b * abs(phi)), phi),
@@ -207,7 +200,8 @@ class MotorPlant:
     terms: Terms = field(default_factory=Terms)  # further physics
 
     def __post_init__(self) -> None:
-        _check("motor", self.inertia_kg_m2, self.viscous_damping_nm_s_rad)
+        require("motor: inertia_kg_m2", self.inertia_kg_m2, positive=True)
+        require("motor: viscous_damping_nm_s_rad", self.viscous_damping_nm_s_rad, positive=False)
 
     def law(self) -> Law:
         """Return the elastic law including effects."""
@@ -228,7 +222,8 @@ class LinkPlant:
     terms: Terms = field(default_factory=Terms)  # further physics
 
     def __post_init__(self) -> None:
-        _check("link", self.inertia_kg_m2, self.viscous_damping_nm_s_rad)
+        require("link: inertia_kg_m2", self.inertia_kg_m2, positive=True)
+        require("link: viscous_damping_nm_s_rad", self.viscous_damping_nm_s_rad, positive=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -253,10 +248,3 @@ class JointPlant:
     def rigid(self) -> bool:
         """Whether motor and link are one body."""
         return self.arrangement == "single" and self.motors[0].spring.rigid
-
-
-def _check(body: str, inertia: float, damping: float) -> None:
-    if not (math.isfinite(inertia) and inertia > 0.0):
-        raise SimError(f"{body}: inertia_kg_m2: expected a finite number > 0, got {inertia!r}")
-    if not (math.isfinite(damping) and damping >= 0.0):
-        raise SimError(f"{body}: viscous_damping_nm_s_rad: expected a finite number >= 0, got {damping!r}")

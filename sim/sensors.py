@@ -15,7 +15,7 @@ import numpy as np
 
 from sim.effects.assembly import LinkParts, MotorParts, Reading
 from sim.effects.memory import Delayed, Lag, PositionHistory
-from sim.errors import SimError
+from sim.errors import SimError, require
 
 RPM_RAD_S = 2.0 * math.pi / 60.0
 """One revolution per minute."""
@@ -51,12 +51,12 @@ class DriveHardware:
 
     def __post_init__(self) -> None:
         for name in ("counts_per_rev", "gear_ratio", "torque_constant_nm_a", "rated_current_a"):
-            _require(name, getattr(self, name), positive=True)
+            require(name, getattr(self, name), positive=True)
         for name in ("max_current_a", "current_resolution_a"):
             if getattr(self, name) is not None:
-                _require(name, getattr(self, name), positive=True)
+                require(name, getattr(self, name), positive=True)
         for name in ("current_noise_a", "velocity_resolution_rad_s"):
-            _require(name, getattr(self, name), positive=False)
+            require(name, getattr(self, name), positive=False)
         for name in ("direction", "torque_direction"):
             if getattr(self, name) not in (1, -1, None):
                 raise SimError(f"{name}: expected 1 or -1, got {getattr(self, name)!r}")
@@ -99,8 +99,8 @@ class LinkEncoder:
     noise_counts: float = 0.0  # standard deviation of its reading before it is rounded
 
     def __post_init__(self) -> None:
-        _require("counts_per_rev", self.counts_per_rev, positive=True)
-        _require("noise_counts", self.noise_counts, positive=False)
+        require("counts_per_rev", self.counts_per_rev, positive=True)
+        require("noise_counts", self.noise_counts, positive=False)
         if self.direction not in (1, -1):
             raise SimError(f"direction: expected 1 or -1, got {self.direction!r}")
 
@@ -108,12 +108,6 @@ class LinkEncoder:
     def counts_per_rad(self) -> float:
         """Signed counts per radian of the joint."""
         return self.direction * self.counts_per_rev / (2.0 * math.pi)
-
-
-def _require(name: str, value: float, *, positive: bool) -> None:
-    bound = "> 0" if positive else ">= 0"
-    if not (math.isfinite(value) and (value > 0.0 if positive else value >= 0.0)):
-        raise SimError(f"{name}: expected a finite number {bound}, got {value!r}")
 
 
 def noise(seed: tuple[int, ...], std: float) -> Iterator[float]:

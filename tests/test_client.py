@@ -140,6 +140,10 @@ def test_the_external_torque_comes_with_the_estimate_of_its_cycles_and_of_no_oth
     assert joint.external is None and not joint.contact
     put_external(publisher, make_external(40, status=3), time.time_ns())
     until(lambda: joint.contact)
+    joint._feed.identity.bound = (
+        "a successor"  # which has said nothing yet: what its predecessor said is not its word
+    )
+    assert joint.external is None and joint.model is None
 
 
 def test_waiting_gives_the_next_cycle_once(publisher, joint):

@@ -151,10 +151,9 @@ class Held:
         """Return the simplest of the models that held-out data cannot tell from the best, and over which no
         other of these with as few effects is confirmed.
 
-        The best is confirmed over some of the models. Whatever scores less than one of these is out as well,
-        though its own difference to the best may be too scattered to be confirmed. Simple is what has the
-        larger prior: few parameters, and declared numbers that are believed. Then, of laws for the same
-        phenomena that leave no more than laws leave anyway, the simplest is chosen.
+        Simple is what has the larger prior: few parameters, and declared numbers that are believed. Then, of
+        laws for the same phenomena that leave no more than laws leave anyway, the simplest is chosen, if it
+        scores more than every model over which the best is confirmed.
         """
 
         def score(one: Fitted) -> float:
@@ -163,17 +162,17 @@ class Held:
         best = max(models, key=score)
         errors = self._independent(best)
         ruled_out = [one for one in models if self.confirms(best, one)]
-        least = max(map(score, ruled_out), default=-math.inf)
-        left = [one for one in models if score(one) > least]
-        left.sort(key=lambda one: -one.log_prior(errors, self.price))
-        found = next((one for one in left if not self._beaten(one, left)), best)
-        most = self.squared(found)
+        alike = [one for one in models if not self.confirms(best, one)]
+        alike.sort(key=lambda one: -one.log_prior(errors, self.price))
+        found = next((one for one in alike if not self._beaten(one, alike)), best)
+        most, least = self.squared(found), max(map(score, ruled_out), default=-math.inf)
         laws = [
             one
-            for one in left
+            for one in models
             if one.families == found.families
             and one.parameters < found.parameters
             and self.squared(one) - most < float(np.mean(self._least(one)))
+            and score(one) > least
         ]
         return max([found, *laws], key=lambda one: one.log_prior(errors, self.price))
 

@@ -116,6 +116,14 @@ def test_joints_come_by_urgency_with_what_changed_since_when():
     assert joints["rubs"]["sentence"] == "New at the motor since 2026-01-14: Coulomb friction."
 
 
+@pytest.mark.parametrize(("nights", "said"), [(5, "Too few recordings"), (6, "Steady.")])
+def test_no_joint_is_called_steady_by_fewer_recordings_than_show_a_change(nights, said):
+    (joint,) = summarise([night("elbow", k, 150.0 + 0.1 * (k % 2), []) for k in range(nights)], 0.05)[
+        "joints"
+    ]
+    assert joint["sentence"].startswith(said)
+
+
 def test_an_unusable_stiffness_is_no_point_of_the_trend_but_a_cross_on_the_chart():
     rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
     rows[4] |= {"stiffness_middle_nm_rad": -20.0, "parameters": '{"k_nm_rad": -20.0}'}

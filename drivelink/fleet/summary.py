@@ -14,6 +14,7 @@ from scipy.stats import false_discovery_control
 from drivelink import __version__
 from drivelink.fleet.analysis import stiffness_at
 from drivelink.fleet.changes import (
+    LEAST,
     Appearance,
     SeriesChange,
     SeriesTest,
@@ -327,6 +328,9 @@ def _sentence(
         return f"No significant change, but the last recording says: {last['sentence']}"
     if state == "undecided":
         return "The motion does not reveal the stiffness or what could be missing: record a richer one."
+    fewest = min(len(one["series"]) for one in transmissions)
+    if fewest < LEAST:
+        return f"Too few recordings with a stiffness to judge a change: {fewest}, of {LEAST} or more."
     return "Steady."
 
 

@@ -32,7 +32,7 @@ def joint(**motor: object) -> JointModel:
 
 
 @cache
-def run(seconds: float = 2.5) -> Record:
+def run(seconds: float = 1.5) -> Record:
     torque, stiffness = polynomial(np.array([[[8.0]]]))
     plants = Plants(
         torque, stiffness, B=0.02, D=0.05, M=0.04,
@@ -44,7 +44,7 @@ def run(seconds: float = 2.5) -> Record:
 
 
 def test_the_free_run_of_the_true_model_is_what_another_integrator_gives():
-    made = free_run(run(), joint(effects=(FRICTION,)), 2.5)
+    made = free_run(run(), joint(effects=(FRICTION,)), 1.5)
     assert made.channels == ("motor1_position", "link_position", "motor1_deflection")
     assert min(made.fit_percent.values()) > 99.0
     assert max(made.coasting_percent.values()) < 10.0  # no fit for nothing
@@ -71,11 +71,11 @@ def test_a_wrong_model_fits_worse(wrong):
 def test_the_horizon_shrinks_until_a_drifting_run_fits_and_windows_with_a_gap_are_left_out():
     truth = run()
     bad = joint(inertia_kg_m2=0.4)
-    assert min(free_run(truth, bad, 2.5).fit_percent.values()) < 0.0
+    assert min(free_run(truth, bad, 1.5).fit_percent.values()) < 0.0
     chosen = free_run(truth, bad)
-    assert chosen.horizon_s < 2.5 and min(chosen.fit_percent.values()) > 0.0
-    gap = np.arange(len(truth)) + 7 * (np.arange(len(truth)) > 1250)
-    assert len(free_run(replace(truth, sequence=gap), joint(), 0.5).time_s) == 2000
+    assert chosen.horizon_s < 1.5 and min(chosen.fit_percent.values()) > 0.0
+    gap = np.arange(len(truth)) + 7 * (np.arange(len(truth)) > 750)
+    assert len(free_run(replace(truth, sequence=gap), joint(), 0.5).time_s) == 1000
 
 
 def test_what_cannot_be_simulated_is_one_line_and_the_fit_figure_is_that_of_matlab_s_compare():

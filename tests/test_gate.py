@@ -147,7 +147,7 @@ def test_two_faults_at_once_and_a_reversed_motor_of_a_pair_are_named(kind, seed,
 
 @pytest.fixture(scope="module")
 def degrees() -> gatekit.Drawn:
-    drawn = gatekit.draw("soft", 3)
+    drawn = gatekit.draw("soft", 3, seconds=6.0)
     wrong = gatekit.faulty(drawn.record, {"motor1_position": DEGREE, "link_position": DEGREE})
     return replace(drawn, record=wrong)
 

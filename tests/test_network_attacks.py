@@ -7,6 +7,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 from struct import pack
+from types import SimpleNamespace
 
 import pytest
 import zenoh
@@ -187,6 +188,22 @@ def test_tokens_of_others_lock_nobody_out_fill_no_memory_and_reach_no_terminal(p
     close_session(session)
 
 
+def test_a_joint_that_made_room_for_invented_ones_is_shown_though_its_token_was_seen_before_them(
+    publisher, endpoint
+):
+    """The history of tokens comes in any order: the daemon's, invented joints, then others' for the same joint."""
+    session = open_client(endpoint)
+    watcher = Watcher(session)
+    until(lambda: watcher.poll() or "elbow" in watcher.views)
+    names = [*(f"drivelink/made-up-{k}/alive" for k in range(MAX_JOINTS)), f"drivelink/elbow/alive/{7:032x}"]
+    watcher._claims.extend(SimpleNamespace(key_expr=name, kind=zenoh.SampleKind.PUT) for name in names)
+    until(lambda: publish(publisher) and not watcher.poll() and watcher.views["elbow"].history.latest)
+    seen = watcher.received
+    until(lambda: publish(publisher) and not watcher.poll() and watcher.received > seen + 10)
+    watcher.close()
+    close_session(session)
+
+
 FORGED = {
     "estimate": encode_estimate(make_estimate(999_999), 1),
     "sample": encode_sample(Sample(999_999, (9.0,), (9.0,), (9.0,), 9.0), 1),
@@ -242,6 +259,7 @@ IDENTITY = {
     ),
     "more tokens than are remembered lock nobody out": (
         *(f"+{number:x}" for number in range(MAX_CLAIMS + 10)), "+abcdef0123456789", ("abcdef0123456789", True, True),
+        ("abcdef0123456789", False, True), ("1", False, True), ("abcdef0123456789", False, False),
     ),
 }  # fmt: skip
 

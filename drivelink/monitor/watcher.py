@@ -27,8 +27,8 @@ _STALE_S = 1.0  # after which another session may take over without a liveliness
 class _Joint:
     """One joint: its accepted session and its view."""
 
-    def __init__(self, name: str) -> None:
-        self.identity = DaemonIdentity()
+    def __init__(self, name: str, incomplete: bool) -> None:
+        self.identity = DaemonIdentity(incomplete)
         self.view = JointView(clean_text(name, _NAME))
         self.heard_s = -float("inf")
         self.estimate_s = -float("inf")
@@ -55,6 +55,7 @@ class Watcher:
         self._hint_s = time.monotonic() + PATIENCE_S
         self._hint = ""
         self._joints: dict[str, _Joint] = {}
+        self._crowded = False  # whether a joint, with its tokens, has made room for another
         self._samples: Any = None
         self._claims: deque[zenoh.Sample] = deque()  # tokens that came since the last poll
         ring = zenoh.handlers.RingChannel
@@ -165,5 +166,6 @@ class Watcher:
                 if idle is None:
                     return None
                 del self._joints[idle]
-            joint = self._joints[name] = _Joint(name)
+                self._crowded = True
+            joint = self._joints[name] = _Joint(name, self._crowded)
         return joint

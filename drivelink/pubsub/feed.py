@@ -133,15 +133,18 @@ class DaemonIdentity:
     """The daemon of one joint, as seen by a subscriber.
 
     `token` may be called from zenoh's thread, all else from the subscriber's.
+
+    Args:
+        incomplete: whether tokens may be there that are not known here.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, incomplete: bool = False) -> None:
         self.bound: str | None = None  # the accepted session, or None
         self.refused = 0  # messages of other sessions
         self._vouched = False  # whether the bound session ever had a token
         self._claims: set[str] = set()
         self._plain = False  # whether the token without a session is there
-        self._overflow = False
+        self._incomplete = incomplete
         self._seen = False
 
     @property
@@ -187,7 +190,7 @@ class DaemonIdentity:
             if len(self._claims) < MAX_CLAIMS:
                 self._claims.add(session)
             else:
-                self._overflow = True
+                self._incomplete = True
 
     def accepts(self, source: str, stale: bool) -> bool:
         """Return whether to accept a message of this session; the first accepted one binds to its session.
@@ -196,11 +199,11 @@ class DaemonIdentity:
             stale: whether the bound session is stale.
         """
         claims = self._claims
-        if source == self.bound and (self._vouched or source in claims or not claims):
+        if source == self.bound and (self._vouched or self._incomplete or source in claims or not claims):
             self._vouched = self._vouched or source in claims
             return True
         free = self.bound is None or (self.bound not in claims if self._vouched else bool(claims) or stale)
-        vouched = source in claims or not claims or (self._overflow and stale)
+        vouched = source in claims or not claims or (self._incomplete and stale)
         if not (free and vouched):
             self.refused += 1
             return False

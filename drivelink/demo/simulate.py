@@ -23,7 +23,7 @@ from sim.canopen.drive import Cia402Drive
 from sim.canopen.encoder import Cia406Encoder
 from sim.canopen.node import Node
 from sim.canopen.profiles import Quirks, profile
-from sim.cases import CASES, Case, case
+from sim.cases import Case, case
 from sim.effects import PlantEffect, make, parse
 from sim.errors import SimError
 from sim.excitation import build
@@ -32,8 +32,6 @@ from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 from sim.sensors import DriveHardware, LinkEncoder
 from sim.variation import following, suitable, typical_torque_nm, with_parameters
 from sim.world import World as World
-
-CASE_NAMES = tuple(CASES)
 
 # Springs for a joint file without parameters (as `new` writes), by stiffness at rest.
 _NATURAL_HZ = 5.0  # sqrt(K/B)/(2 pi) of a soft joint

@@ -3,8 +3,8 @@
 use super::{Blocks, FEWEST, REACHED};
 use crate::balance;
 use crate::gram::{
-    COLUMNS, Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, by_prior, choose, cluster, dot, log_evidence,
-    set, solve, unknowns,
+    COLUMNS, Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, by_prior, choose, cluster, dot,
+    log_evidence, set, solve, unknowns,
 };
 use crate::laws::{Law, PARAMETERS};
 use crate::spring::{MARGIN, Projection};
@@ -79,7 +79,8 @@ impl Blocks {
             frame.directions[i][column] = 1.0;
         }
         let reduced = frame.reduce(total);
-        let wide = std::array::from_fn(|i| WIDE * (reduced[0][0] / reduced[i][i].max(f64::MIN_POSITIVE)).sqrt());
+        let wide =
+            std::array::from_fn(|i| WIDE * (reduced[0][0] / reduced[i][i].max(f64::MIN_POSITIVE)).sqrt());
         let prior = Prior::independent([0.0; UNKNOWNS], &wide);
         let Some(rough) = solve(&reduced, frame.set, &prior, reduced[0][0]) else { return };
         let left = total.quadratic(&frame.residual(&rough.x, rough.set)) / total.rows;

@@ -1,8 +1,8 @@
 """Whether a model that is to be written does harm: it and the declared one over data that it was not made of.
 
 Compared are the balance of the model as it stands, and what the estimator does with it from tick to tick: how
-often it is valid, what it then leaves of the torque, and the external torque against a sensor. Worse is what
-is worse by more than its standard error over the blocks and `harm`.
+often it is valid, the external torque against a sensor, and, where the declared model has no balance yet,
+what is left of the torque. Worse is what is worse by more than its standard error over the blocks and `harm`.
 """
 
 from __future__ import annotations

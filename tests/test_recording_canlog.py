@@ -61,6 +61,14 @@ def test_a_log_without_stamps_has_frames_without_them_and_differences_are_added_
     assert "added up" in caplog.text
 
 
+def test_stamps_in_disorder_are_no_differences(tmp_path):
+    """As a busy machine records a bus of several senders: every second frame is stamped before the one before it."""
+    stamps = [1_436_509_052_000_000 + 250 * k - 400 * (k % 2) for k in range(3000)]
+    path = tmp_path / "x.log"
+    path.write_text("".join(f"({s // 10**6}.{s % 10**6:06}) can0 080#\n" for s in stamps))
+    assert [f.stamp_ns for f in read_frames(path)] == [1000 * s for s in stamps]
+
+
 def many_frames(n=3000):
     rng, ids, begin = random.Random(1), (0x080, 0x181, 0x182, 0x18A), 1_700_000_000_000_000_000
     return [

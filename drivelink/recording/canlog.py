@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime
 from itertools import chain, islice, pairwise
 from pathlib import Path
+from statistics import median
 from typing import IO, Any, NamedTuple
 
 import can
@@ -255,10 +256,15 @@ def _undated(line: bytes) -> bytes:
 
 
 def _dated(first: list[LoggedFrame], frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]:
-    """Frames with absolute stamps: the differences of `candump -t d` are added up."""
+    """Frames with absolute stamps: the differences of `candump -t d` are added up.
+
+    They fall as often as they rise, and the later ones are not larger: those of a busy recorder, which come
+    in disorder, are.
+    """
     stamps = [frame.stamp_ns for frame in first]
     falls = sum(b < a for a, b in pairwise(stamps))
-    if len(stamps) < 8 or falls < 0.2 * len(stamps):
+    half = len(stamps) // 2
+    if len(stamps) < 8 or falls < 0.2 * len(stamps) or median(stamps[half:]) > max(stamps[: half // 2]):
         return iter(frames)
     _LOG.warning("%s: the stamps are differences from frame to frame: added up", path)
     return _added_up(frames)

@@ -19,6 +19,8 @@ from drivelink.cycle.sources import BusLostError, open_source
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
+from drivelink.recording.formats import open_sink
+from drivelink.recording.recorder import BusTap
 from estimator.sample import Status
 
 PERIOD_S = 0.01
@@ -130,18 +132,28 @@ def test_a_passive_serial_adapter_is_opened_listen_only_at_its_bit_rate(tmp_path
     adapter.close()
 
 
-def test_a_socketcand_server_that_goes_and_comes_back_and_a_second_daemon_that_is_refused():
+def test_a_socketcand_server_that_goes_and_comes_back_and_a_second_daemon_that_is_refused(tmp_path):
     joint = joint_on("socketcand", "can0", f'host = "127.0.0.1", port = {free_port()}')
+    sink = open_sink(tmp_path / "x.log", joint)
+
+    def recorded() -> int:
+        before = sink.counts["frame"]
+        tap.poll()
+        return sink.counts["frame"] - before
+
     with ExitStack() as stack:
         with served(joint):
             bus = open_bus(joint.bus)  # a listener
             stack.callback(bus.shutdown)
             source = open_source(bus)
             source.wait(0.01)
+            tap = BusTap(open_bus(joint.bus), joint, sink, None)
+            stack.callback(tap.close)
             daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
             pipeline = daemon.pipelines[0]
             stack.enter_context(running(daemon))
             until(lambda: is_fresh(pipeline))
+            until(recorded)
             reboots = [c.reboots for c in pipeline.assembler.counters.values()]
             with pytest.raises(BusError, match="another master already produces SYNC"):
                 other = joint.model_copy(update={"name": "other"})
@@ -150,6 +162,7 @@ def test_a_socketcand_server_that_goes_and_comes_back_and_a_second_daemon_that_i
             assert not any("configured again" in e["text"] for e in daemon.events.recent())
         until(lambda: lost(daemon))
         until(lambda: not is_fresh(pipeline))
+        until(lambda: not recorded())
         with pytest.raises(BusLostError, match="closed"):
             while True:  # python-can itself would say for ever that there is nothing
                 source.wait(0.01)
@@ -157,6 +170,8 @@ def test_a_socketcand_server_that_goes_and_comes_back_and_a_second_daemon_that_i
         with served(joint):
             until(lambda: is_fresh(pipeline))
             assert not lost(daemon)
+            until(recorded)
+    sink.abandon()
 
 
 def test_error_frames_of_any_interface_are_counted_by_kind():

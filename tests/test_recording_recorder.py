@@ -103,6 +103,7 @@ class InRealTime:
     def __init__(self, source):
         self._source = source
         self._syncs = 0
+        self.wait = source.wait
 
     def take(self):
         frames = []

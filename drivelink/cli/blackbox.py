@@ -17,12 +17,12 @@ from pathlib import Path
 from drivelink import jointfile
 from drivelink.cli import add_bus, moved
 from drivelink.cli.record import add_taps
-from drivelink.errors import BusError, DrivelinkError
+from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile
 from drivelink.loop.blackbox import BlackBox
 from drivelink.loop.finding import folder_of
 from drivelink.loop.queue import Diagnoses
-from drivelink.recording.recorder import BusTap, Recorder
+from drivelink.recording.recorder import Recorder
 
 _LOG = logging.getLogger("drivelink.recording")
 _NICE = 5  # the daemon goes first
@@ -110,13 +110,7 @@ def _serve(source: jointfile.JointText, ended: threading.Event) -> None:
         stack.callback(diagnoses.close)
         recorder = stack.enter_context(Recorder(box, []))
         add_taps(recorder, "auto", source, stack)
-        while not ended.is_set():
-            try:
-                recorder.run(ended.is_set, diagnoses.step)
-            except BusError as error:
-                _LOG.error("%s: the black box goes on without raw CAN: %s", joint.name, error)
-                recorder.taps = [tap for tap in recorder.taps if not isinstance(tap, BusTap)]
-                box.keep("bus lost")
+        recorder.run(ended.is_set, diagnoses.step)
 
 
 if __name__ == "__main__":

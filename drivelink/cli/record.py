@@ -135,9 +135,9 @@ def add_taps(recorder: Recorder, source: str, text: JointText, stack: ExitStack)
             raise
         _say(f"without raw CAN: {error}")
         return
-    stack.callback(bus.shutdown)
     no_samples = alive or "sample" not in sink.wants
     tap_bus = BusTap(bus, joint, sink, None if no_samples else folder, gate, known)
+    stack.callback(tap_bus.close)
     recorder.taps.append(tap_bus)
     if tap_bus.missing:
         _say(f"no samples until the mapping is heard on the bus: {tap_bus.missing}")

@@ -10,6 +10,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -17,9 +18,10 @@ from typing import Any, Self
 import can
 import zenoh
 
+from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.sources import BusLostError, open_source
+from drivelink.cycle.sources import BusLostError, FrameSource, LostSource, open_source
 from drivelink.errors import BusError, ZenohError
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.feed import DECODERS, DaemonIdentity, follow_document, source_of
@@ -35,6 +37,7 @@ _QUEUE = 30_000  # waiting messages per key: half a minute at 1 kHz
 _SNAPSHOTS = 2  # that wait: each has some megabytes
 _FLUSH_S = 1.0
 _POLL_S = 0.005
+_REOPEN_S = 0.5
 _STALE_S = 1.0  # after which another session may take over without a liveliness token
 
 
@@ -150,10 +153,10 @@ class ZenohTap:
 
 
 class BusTap:
-    """Receives the frames of a bus, and makes samples of them without a daemon.
+    """Receives the frames of a bus, and makes samples of them without a daemon; a lost bus is opened again.
 
     Args:
-        bus: an open bus; it stays open.
+        bus: an open bus; `close` closes it.
         base_dir: folder of the joint file; None: make no samples.
         layouts: of its nodes, if reported by a daemon.
     """
@@ -168,15 +171,16 @@ class BusTap:
         layouts: Sequence[NodeLayout] = (),
     ) -> None:
         self._gate = gate or FirstSource(sink)
-        self._source = open_source(bus)
+        self._bus, self._section = bus, joint.bus
+        self._source: FrameSource = open_source(bus)
         self._sink = sink
+        self._reopen_s = 0.0  # when to try next, while the bus is lost
         self._samples: FrameSamples | None = None
         if base_dir is not None:
             listener = PassiveConfigurator([joint], [base_dir])
             listener.adopt(layouts)
             self._samples = FrameSamples(joint, listener)
         self._period_s = joint.bus.period_s  # as said last
-        self.frames = 0  # received so far
 
     @property
     def missing(self) -> str:
@@ -184,20 +188,34 @@ class BusTap:
         return self._samples.missing if self._samples is not None else ""
 
     def poll(self) -> None:
-        """Take everything that has come.
-
-        Raises:
-            BusError: the bus is gone.
-        """
+        """Take everything that has come."""
+        if isinstance(self._source, LostSource):
+            self._reopen()
         try:
-            while frames := self._source.take():
-                for cob_id, data, stamp_ns in frames:
+            while self._source.wait(0.0):
+                for cob_id, data, stamp_ns in self._source.take():
                     self._sink.frame(stamp_ns, cob_id, data)
                     if self._samples is not None:
                         self._put_samples(self._samples.take(LoggedFrame(stamp_ns, cob_id, data, "")))
-                self.frames += len(frames)
         except BusLostError as error:
-            raise BusError(f"the bus is gone: {error}") from error
+            _LOG.error("%s: the bus is lost: %s: no frames until it is back", self._section.channel, error)
+            self._source = LostSource()
+
+    def _reopen(self) -> None:
+        now_s = time.monotonic()
+        if now_s < self._reopen_s:
+            return
+        self._reopen_s = now_s + _REOPEN_S
+        self.close()
+        with suppress(BusError):
+            self._bus = open_bus(self._section)
+            self._source = open_source(self._bus)
+            _LOG.warning("%s: the bus is back", self._section.channel)
+
+    def close(self) -> None:
+        """Close the bus."""
+        with suppress(can.CanError, OSError):
+            self._bus.shutdown()
 
     def finish(self) -> None:
         """Take the samples waiting for later SYNCs."""

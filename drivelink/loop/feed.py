@@ -15,30 +15,42 @@ from drivelink.pubsub.publisher import JointPublisher
 _SNAPSHOT_S = 10.0
 
 
-class SnapshotFeed:
+class _Feed:
+    """Work that is too long for the slack, one thread at a time."""
+
+    _thread: threading.Thread | None = None
+
+    def check(self) -> None:
+        """In the slack: begin the work if it is due."""
+        if (self._thread is None or not self._thread.is_alive()) and self._due():
+            self._thread = threading.Thread(target=self._work, name=type(self).__name__, daemon=True)
+            self._thread.start()
+
+    def _due(self) -> bool:
+        raise NotImplementedError
+
+    def _work(self) -> None:
+        raise NotImplementedError
+
+
+class SnapshotFeed(_Feed):
     """Publishes the state of a joint's estimator now and then: the black box's recordings begin with it."""
 
     def __init__(self, pipeline: JointPipeline, publisher: JointPublisher) -> None:
         self._pipeline, self._publisher = pipeline, publisher
         self._due_s = 0.0
-        self._thread: threading.Thread | None = None
 
-    def check(self) -> None:
-        """In the slack: begin to make one if it is due and a black box listens."""
-        if self._thread is not None and self._thread.is_alive():
-            return
-        if self._publisher.snapshot_wanted and time.monotonic() >= self._due_s:
-            self._thread = threading.Thread(target=self._make, name="snapshot", daemon=True)
-            self._thread.start()
+    def _due(self) -> bool:
+        return self._publisher.snapshot_wanted and time.monotonic() >= self._due_s
 
-    def _make(self) -> None:
+    def _work(self) -> None:
         made = self._pipeline.snapshot()
         if made is not None:
             self._due_s = time.monotonic() + _SNAPSHOT_S
             self._publisher.put_snapshot(*made)
 
 
-class FindingFeed:
+class FindingFeed(_Feed):
     """Watches the folder of a black box.
 
     Args:
@@ -49,28 +61,25 @@ class FindingFeed:
     def __init__(self, folder: Path, joint: str, publish: Callable[[Mapping[str, Any]], None]) -> None:
         self._folder, self._joint, self._publish = folder, joint, publish
         self._seen = 0
-        self._thread: threading.Thread | None = None
         self._found: Mapping[str, Any] | None = None
         self._published: Mapping[str, Any] | None = None
 
     def check(self) -> None:
-        """In the slack: begin to read if the folder has changed, publish what was read."""
+        """In the slack: publish what was read; begin to read if the folder has changed."""
         if self._found is not None:
             found, self._found = self._found, None
             if found != self._published:
                 self._published = found
                 self._publish(found)
-        if self._thread is not None and self._thread.is_alive():
-            return
-        try:
-            seen = self._folder.stat().st_mtime_ns
-        except OSError:
-            return
-        if seen != self._seen:
-            self._seen = seen
-            self._thread = threading.Thread(target=self._read, name="finding", daemon=True)
-            self._thread.start()
+        super().check()
 
-    def _read(self) -> None:
+    def _due(self) -> bool:
+        try:
+            before, self._seen = self._seen, self._folder.stat().st_mtime_ns
+        except OSError:
+            return False
+        return self._seen != before
+
+    def _work(self) -> None:
         newest = finding.newest(self._folder, self._joint)
         self._found = newest[1] if newest is not None else {}

@@ -131,12 +131,12 @@ class Watcher:
         if joint is None or not joint.identity.accepts(source_of(sample), now_s - joint.heard_s > _STALE_S):
             self.refused += 1
             return
+        joint.heard_s = now_s
         try:
             message = DECODERS[kind](sample.payload.to_bytes())
         except ZenohError:
             self.refused += 1
             return
-        joint.heard_s = now_s
         if kind in DOCUMENTS:
             setattr(joint.view, kind, message)
         elif kind == "sample":

@@ -174,12 +174,6 @@ class Client:
         return self._feed.arrivals.age_ns(time.monotonic_ns()) / 1e9
 
     @property
-    def sync_age_s(self) -> float:
-        """Time since the SYNC of the latest estimate, s, if both machines' UNIX clocks agree."""
-        latest = self.latest()
-        return math.inf if latest is None else (time.time_ns() - latest.stamp_ns) / 1e9
-
-    @property
     def stale(self) -> bool:
         """Whether the latest estimate is too old to act on, or missing."""
         self._drain()

@@ -7,11 +7,13 @@ included: 55 for a SYNC, 135 for eight bytes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from drivelink.errors import BusError, JointFileError
 from drivelink.jointfile import BusSection, DriveSection, EncoderSection, JointFile, TpdoSection
@@ -206,28 +208,16 @@ def layout_document(layout: NodeLayout) -> dict[str, Any]:
     return document
 
 
-def layout_from(document: Mapping[str, Any]) -> NodeLayout:
+_LAYOUT = TypeAdapter(NodeLayout)
+
+
+def layout_from(document: Any) -> NodeLayout:
     """Return a layout from its plain values.
 
     Raises:
-        ValueError, KeyError, TypeError: they are none.
+        ValueError: they are none.
     """
-    vendor, product, revision, serial = document["identity"]
-    return NodeLayout(
-        node_id=document["node_id"],
-        motor=document["motor"],
-        heartbeat_ms=document["heartbeat_ms"],
-        identity=(vendor, product, revision, serial),
-        tpdos=tuple(_tpdo_from(tpdo) for tpdo in document["tpdos"]),
-        other_tpdos=tuple(_tpdo_from(tpdo) for tpdo in document["other_tpdos"]),
-    )
-
-
-def _tpdo_from(document: Mapping[str, Any]) -> TpdoLayout:
-    objects = tuple(
-        MappedObject(**{**each, "signal": Signal(each["signal"])}) for each in document["objects"]
-    )
-    return TpdoLayout(**{**document, "objects": objects})
+    return _LAYOUT.validate_python(document)
 
 
 @dataclass(slots=True, kw_only=True)

@@ -16,7 +16,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import can
 
@@ -58,23 +58,36 @@ class BusLostError(Exception):
         super().__init__(" ".join(reason.partition("Traceback (most recent call last)")[0].split()))
 
 
-class FrameSource(Protocol):
-    """Interface of a bus for the loop."""
+class FrameSource:
+    """Interface of a bus for the loop; by itself, a bus on which nothing comes."""
 
-    lost_sends: int  # frames that could not be sent because the transmit queue was full
-    errors: dict[str, int]  # error frames, by kind
+    def __init__(self) -> None:
+        self.lost_sends = 0  # frames that could not be sent because the transmit queue was full
+        self.errors: dict[str, int] = {}  # error frames, by kind
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a frame is known to be there."""
+        return False
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for a frame; return whether there is one."""
+        time.sleep(max(timeout_s, 0.0))
+        return False
 
     def take(self) -> list[CanFrame]:
         """Return the received data frames with 11-bit identifiers, in order."""
+        return []
 
     def send(self, cob_id: int, data: bytes) -> None:
         """Send a frame; a full transmit queue is counted, not raised."""
 
     def narrow(self, cob_ids: Iterable[int]) -> None:
         """Receive these identifiers only, if the kernel can filter."""
+
+
+class LostSource(FrameSource):
+    """Stands in for a lost bus."""
 
 
 def note_error(errors: dict[str, int], can_id: int, data: bytes) -> None:
@@ -86,18 +99,17 @@ def note_error(errors: dict[str, int], can_id: int, data: bytes) -> None:
         errors[kind] = errors.get(kind, 0) + 1
 
 
-class BusSource:
-    """Any python-can interface, by `recv` and `send`."""
+class BusSource(FrameSource):
+    """Any python-can interface, by `recv` and `send`; python-can filters after reception."""
 
     def __init__(self, bus: can.BusABC) -> None:
+        super().__init__()
         self._bus = bus
         self._waiting: list[can.Message] = []
-        self.lost_sends = 0
-        self.errors: dict[str, int] = {}
 
     @property
     def waiting(self) -> bool:
-        """Whether a frame is known to be there."""
+        """See FrameSource."""
         return bool(self._waiting)
 
     def wait(self, timeout_s: float) -> bool:
@@ -129,9 +141,6 @@ class BusSource:
             self.lost_sends += 1
         except OSError as error:
             raise BusLostError(str(error)) from error
-
-    def narrow(self, cob_ids: Iterable[int]) -> None:
-        """Do nothing: python-can filters after reception."""
 
     def _frames(self, messages: list[can.Message]) -> list[CanFrame]:
         frames = []
@@ -168,7 +177,7 @@ class VirtualSource(BusSource):
 
     @property
     def waiting(self) -> bool:
-        """Whether a frame is known to be there."""
+        """See FrameSource."""
         return bool(self._pending or self._waiting)
 
     def _receive(self, timeout_s: float) -> can.Message | None:
@@ -201,18 +210,18 @@ class VirtualSource(BusSource):
             raise BusLostError("the virtual bus is closed")
 
 
-class Pumped:
+class Pumped(FrameSource):
     """A bus with simulated devices in this thread, which answer immediately.
 
     Args:
         devices: lets them handle sent frames and due timers.
     """
 
-    def __init__(self, source: BusSource, devices: Callable[[], object]) -> None:
+    def __init__(self, source: FrameSource, devices: Callable[[], object]) -> None:
+        super().__init__()
         self._source, self._devices = source, devices
-        self.lost_sends = 0
         self.errors = source.errors
-        self.wait, self.narrow = source.wait, source.narrow
+        self.wait = source.wait  # type: ignore[method-assign]
 
     def take(self) -> list[CanFrame]:
         """See FrameSource."""
@@ -227,33 +236,10 @@ class Pumped:
         self._devices()
 
 
-class LostSource:
-    """Stands in for a lost bus: receives and sends nothing."""
-
-    def __init__(self) -> None:
-        self.lost_sends = 0
-        self.errors: dict[str, int] = {}
-
-    def wait(self, timeout_s: float) -> bool:
-        """See FrameSource."""
-        time.sleep(max(timeout_s, 0.0))
-        return False
-
-    def take(self) -> list[CanFrame]:
-        """See FrameSource."""
-        return []
-
-    def send(self, cob_id: int, data: bytes) -> None:
-        """Nothing."""
-
-    def narrow(self, cob_ids: Iterable[int]) -> None:
-        """Nothing."""
-
-
 _SO_RXQ_OVFL = 40  # socket(7): number of dropped frames; not in the socket module
 
 
-class SocketCanSource:
+class SocketCanSource(FrameSource):
     """A SocketCAN socket, read without python-can's Message."""
 
     _FRAME = struct.Struct("=IB3x8s")
@@ -263,6 +249,7 @@ class SocketCanSource:
     _ERROR = 0x20000000
 
     def __init__(self, bus: Any) -> None:
+        super().__init__()
         self._bus = bus
         self._socket: socket.socket = bus.socket
         self._socket.setblocking(False)
@@ -270,8 +257,6 @@ class SocketCanSource:
         self._dropped = 0
         self._buffer = bytearray(72)
         self._sent: dict[tuple[int, bytes], bytes] = {}
-        self.lost_sends = 0
-        self.errors: dict[str, int] = {}
 
     def wait(self, timeout_s: float) -> bool:
         """See FrameSource."""
@@ -351,14 +336,14 @@ class SocketcandSource(BusSource):
         return False
 
 
+_FASTER: dict[str, Callable[[Any], FrameSource]] = {
+    "SocketcanBus": SocketCanSource,
+    "SocketCanDaemonBus": SocketcandSource,
+    "VirtualBus": VirtualSource,
+}
+
+
 def open_source(bus: can.BusABC, devices: Callable[[], object] | None = None) -> FrameSource:
     """Open the fastest source for this bus, also with devices in this thread."""
-    if devices is not None:
-        return Pumped(VirtualSource(bus) if type(bus).__name__ == "VirtualBus" else BusSource(bus), devices)
-    if type(bus).__name__ == "SocketcanBus":
-        return SocketCanSource(bus)
-    if type(bus).__name__ == "SocketCanDaemonBus":
-        return SocketcandSource(bus)
-    if type(bus).__name__ == "VirtualBus":
-        return VirtualSource(bus)
-    return BusSource(bus)
+    source = _FASTER.get(type(bus).__name__, BusSource)(bus)
+    return source if devices is None else Pumped(source, devices)

@@ -146,11 +146,10 @@ class Node:
         self.emergency.reset()
         for pdo in (*self.tpdos.values(), *self.rpdos.values()):
             pdo.compile()
-        self.heartbeat.stop()
         self.consumer.restart()
         self._take_sync_id()
         if self.quirks.boot_s:
-            self.timers.after(self.quirks.boot_s, self._boot)
+            self.timers.set("boot", self.quirks.boot_s, self._boot)
         else:
             self._boot()
 
@@ -192,7 +191,7 @@ class Node:
         self._latched = tuple(pdo for pdo in received if pdo.synchronous)
         self.reroute()
         if self._change_driven:
-            self.timers.after(0.0, self.process)
+            self.timers.set("process", 0.0, self.process)
 
     def reroute(self) -> None:
         """Rebuild the table of which identifier it receives."""

@@ -10,7 +10,6 @@ import struct
 from typing import TYPE_CHECKING
 
 from sim.canopen.dictionary import Abort, Entry, SdoAbortedError
-from sim.canopen.timers import Timer
 
 if TYPE_CHECKING:
     from sim.canopen.node import Node
@@ -62,7 +61,6 @@ class Pdo:
         self._generation = 0
         self.event_s = 0.0  # event timer or deadline; 0: none
         self._condition: tuple[bool, bool, int] | None = None
-        self._timer: Timer | None = None
         self._cob.check, self._type.check = self._check_cob, self._check_type
         self._cob.changed = self._type.changed = self._event.changed = self.compile
         self._count.check = self._check_count
@@ -96,17 +94,12 @@ class Pdo:
         condition = (active, counting, self._generation)
         if condition != self._condition:
             self._condition = condition
-            self._stop_timer()
+            self._node.timers.cancel(self)
             self._begin(active, counting)
 
     def _begin(self, active: bool, counting: bool) -> None:
         """Begin in another state, or with other parameters."""
         raise NotImplementedError
-
-    def _stop_timer(self) -> None:
-        if self._timer:
-            self._timer.cancel()
-            self._timer = None
 
     def _check_cob(self, value: int) -> None:
         if self._node.quirks.fixed_pdos:
@@ -183,19 +176,17 @@ class Tpdo(Pdo):
         self._syncs = 0
         self._waiting = False  # for the SYNC that carries the start value
         self._last: bytes | None = None
-        self._inhibited: Timer | None = None
 
     def _allows(self, entry: Entry | None) -> bool:
         return entry is not None and entry.transmittable
 
     def _begin(self, active: bool, counting: bool) -> None:
-        if self._inhibited:
-            self._inhibited.cancel()
-        self._inhibited = self._last = None
+        self._node.timers.cancel(self._inhibit)
+        self._last = None
         self._syncs = 0
         self._waiting = bool(active and counting and self._start.number)
         if active and not self.synchronous and self.event_s:
-            self._timer = self._node.timers.after(self.event_s, self._event_due)
+            self._node.timers.set(self, self.event_s, self._event_due)
 
     def pack(self) -> bytes:
         """Return the frame with the present values."""
@@ -224,30 +215,24 @@ class Tpdo(Pdo):
 
     def event(self) -> None:
         """Send an event-driven PDO if its data have changed."""
-        if not self._inhibited:
+        if self._inhibit not in self._node.timers:
             data = self.pack()
             if data != self._last:
                 self._send_event(data)
 
     def _event_due(self) -> None:
-        self._timer = None
-        if self._inhibited:
-            self._timer = self._node.timers.after(self._inhibit.number * 1e-4, self._event_due)
+        if self._inhibit in self._node.timers:
+            self._node.timers.set(self, self._inhibit.number * 1e-4, self._event_due)
         else:
             self._send_event(self.pack())
 
     def _send_event(self, data: bytes) -> None:
         self._last = data
         if self._inhibit.number:
-            self._inhibited = self._node.timers.after(self._inhibit.number * 1e-4, self._release)
+            self._node.timers.set(self._inhibit, self._inhibit.number * 1e-4, self.event)
         if self.event_s:
-            self._stop_timer()
-            self._timer = self._node.timers.after(self.event_s, self._event_due)
+            self._node.timers.set(self, self.event_s, self._event_due)
         self.emit(self.can_id, data)
-
-    def _release(self) -> None:
-        self._inhibited = None
-        self.event()
 
 
 class Rpdo(Pdo):
@@ -272,9 +257,8 @@ class Rpdo(Pdo):
             self._fail(_TOO_SHORT if len(data) < self.layout.size else _TOO_LONG)
         if len(data) < self.layout.size:
             return
-        self._stop_timer()
         if self.event_s:
-            self._timer = self._node.timers.after(self.event_s, lambda: self._fail(_RPDO_TIMEOUT))
+            self._node.timers.set(self, self.event_s, lambda: self._fail(_RPDO_TIMEOUT))
         self._pending = data
         if not self.synchronous:
             self.apply()

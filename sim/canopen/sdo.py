@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from canopen.sdo.server import SdoServer as CanopenServer
 
 from sim.canopen.dictionary import LONGEST_STRING, Abort, SdoAbortedError
-from sim.canopen.timers import Timer
 
 if TYPE_CHECKING:
     from sim.canopen.node import Node
@@ -33,7 +32,6 @@ class SdoServer(CanopenServer):
         # for tests: bytes in each segment of an upload that never ends; -1: normal operation
         self.endless = -1
         self._device = node
-        self._timer: Timer | None = None
         self._index = self._subindex = 0
         self.reset()
 
@@ -109,9 +107,6 @@ class SdoServer(CanopenServer):
         return bytes([data[0] & 0x10 | (7 - self.endless) << 1]) + b"\xff" * 7
 
     def _watch(self) -> None:
-        if self._timer:
-            self._timer.cancel()
-        busy = self._buffer is not None
-        self._timer = (
-            self._device.timers.after(_TIMEOUT_S, lambda: self.abort(Abort.TIMEOUT)) if busy else None
-        )
+        self._device.timers.cancel("sdo")
+        if self._buffer is not None:
+            self._device.timers.set("sdo", _TIMEOUT_S, lambda: self.abort(Abort.TIMEOUT))

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from sim.canopen.dictionary import Abort, Dictionary, Entry, SdoAbortedError
 from sim.canopen.pdo import COB_INVALID
-from sim.canopen.timers import Timer
 
 if TYPE_CHECKING:
     from sim.canopen.node import Node
@@ -34,7 +33,6 @@ class Emergency:
         self._fields = [find(0x1003, k) for k in range(1, _HISTORY + 1)]
         self._active: dict[int, int] = {}
         self._queue: list[bytes] = []
-        self._inhibited = False
         self._count.check = self._check_clear
         self._count.changed = self._clear_history
         for number, entry in enumerate(self._fields, start=1):
@@ -49,7 +47,6 @@ class Emergency:
         """Forget all errors."""
         self._active.clear()
         self._queue.clear()
-        self._inhibited = False
         self._register.value = 0
         self._clear_history()
 
@@ -79,17 +76,13 @@ class Emergency:
             self._flush()
 
     def _flush(self) -> None:
-        while self._queue and not self._inhibited:
+        timers, inhibit_s = self._node.timers, self._inhibit.number * 1e-4
+        while self._queue and "emergency" not in timers:
             data = self._queue.pop(0)
             if self._node.may_send_emergency:
                 self._node.send(self._cob.number & 0x7FF, data)
-            if self._inhibit.number:
-                self._inhibited = True
-                self._node.timers.after(self._inhibit.number * 1e-4, self._release)
-
-    def _release(self) -> None:
-        self._inhibited = False
-        self._flush()
+            if inhibit_s:
+                timers.set("emergency", inhibit_s, self._flush)
 
     def _check_clear(self, value: int) -> None:
         if value:
@@ -115,19 +108,12 @@ class HeartbeatProducer:
         self._node = node
         self._period = node.dictionary.find(0x1017, 0)
         self._period.changed = self.restart
-        self._timer: Timer | None = None
-
-    def stop(self) -> None:
-        """Send no further heartbeat."""
-        if self._timer:
-            self._timer.cancel()
-            self._timer = None
 
     def restart(self) -> None:
         """Apply a changed period; the first heartbeat is one period from now."""
-        self.stop()
+        self._node.timers.cancel("heartbeat")
         if self._period.number:
-            self._timer = self._node.timers.after(self._period.number * 1e-3, self._beat)
+            self._node.timers.set("heartbeat", self._period.number * 1e-3, self._beat)
 
     def _beat(self) -> None:
         self.restart()
@@ -140,7 +126,7 @@ class HeartbeatConsumer:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._entries = [e for e in node.dictionary if e.item.index == 0x1016 and e.item.subindex]
-        self._deadlines: dict[int, Timer] = {}
+        self._heard: set[int] = set()
         self._missing: set[int] = set()
         for entry in self._entries:
             entry.check = self._checker(entry)
@@ -156,9 +142,9 @@ class HeartbeatConsumer:
 
     def restart(self) -> None:
         """Forget what was heard and wait for first heartbeats."""
-        for timer in self._deadlines.values():
-            timer.cancel()
-        self._deadlines.clear()
+        for node_id in self._heard:
+            self._node.timers.cancel(("heartbeat", node_id))
+        self._heard.clear()
         self._missing.clear()
         self._node.reroute()
 
@@ -167,9 +153,8 @@ class HeartbeatConsumer:
         time_s = self.watched.get(node_id)
         if time_s is None:
             return
-        if node_id in self._deadlines:
-            self._deadlines[node_id].cancel()
-        self._deadlines[node_id] = self._node.timers.after(time_s, lambda: self._expired(node_id))
+        self._heard.add(node_id)
+        self._node.timers.set(("heartbeat", node_id), time_s, lambda: self._expired(node_id))
         if node_id in self._missing:
             self._missing.discard(node_id)
             self._node.heartbeat_back()

@@ -77,9 +77,9 @@ def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(able
         settle(made)
         heartbeat = made.node(2).heartbeat
         heartbeat._period.value = 0
-        heartbeat.stop()
+        heartbeat.restart()
         if not able:
-            heartbeat._period.changed = heartbeat.stop
+            heartbeat._period.changed = lambda: None
         made.run(8000 + ENOUGH)
         said = [text for text in made.events if text.startswith("node 2")]
         assert sum("is configured again" in text for text in said) == 1

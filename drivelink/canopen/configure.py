@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.bus import FrameBus, Idle, frames, is_canopen, listening_s, run_program, sender
@@ -24,15 +25,16 @@ from drivelink.canopen.layout import (
 )
 from drivelink.canopen.mapping import NMT_START
 from drivelink.canopen.node import configure_node
-from drivelink.canopen.sdo import Program, Read, SdoTimeout, Session
+from drivelink.canopen.sdo import Program, SdoTimeout, Session
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.notice import log_notices
 
 logger = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 _DEVICE_TYPE = 0x1000  # what a node is asked for first
-_NUMBER_BYTES = 8
 
 
 class Configurator:
@@ -83,9 +85,9 @@ class Configurator:
             retries=self.bus.sdo_retries,
         )
 
-    def ask(self, node: int, address: tuple[int, int]) -> Session[bytes]:
-        """Begin to read an object of a node, once; the caller feeds and polls the session."""
-        return Session(_reading(node, address), self._send, timeout_s=self.bus.sdo_timeout_s, retries=0)
+    def run(self, program: Program[T]) -> Session[T]:
+        """Return the session of a program whose requests are not repeated; the caller feeds and polls it."""
+        return Session(program, self._send, timeout_s=self.bus.sdo_timeout_s, retries=0)
 
     @property
     def busy(self) -> bool:
@@ -126,10 +128,6 @@ class Configurator:
     def load(self) -> BusLoad:
         """Return the bus load of all configured nodes."""
         return bus_load(self.layouts.values(), self.bus)
-
-
-def _reading(node: int, address: tuple[int, int]) -> Program[bytes]:
-    return (yield Read(node, *address, most=_NUMBER_BYTES))
 
 
 def configure_joints(

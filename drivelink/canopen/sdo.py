@@ -237,6 +237,11 @@ class Session(Generic[T]):
         self._error: Exception | None = None
 
     @property
+    def asks(self) -> int | None:
+        """The node whose answer it waits for, or None."""
+        return self._transfer.request.node if self._transfer is not None else None
+
+    @property
     def result(self) -> T:
         """What the program returned.
 

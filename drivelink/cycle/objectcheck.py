@@ -13,12 +13,12 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import count, islice
 from typing import Any
 
 from drivelink._core import Assembler
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal
-from drivelink.canopen.sdo import Session
+from drivelink.canopen.sdo import Pause, Program, Read, Session
 from drivelink.canopen.sdo_sniffer import SdoSniffer
 from drivelink.errors import DriveError
 from estimator.sample import Sample
@@ -61,7 +61,7 @@ class _Object:
     unit: int = 0  # its value when the node was configured
     mapped: tuple[MappedObject, Pick] | None = None  # where a sample has it; None: it is a unit
     doubts: int = 0  # answers in a row that contradict
-    asked_s: float = -math.inf  # when it was asked for last
+    asked: int = 0  # the turn in which it was asked for last; 0: never
 
     @property
     def signal(self) -> Signal | None:
@@ -261,25 +261,25 @@ def _objects(layout: NodeLayout) -> dict[Address, _Object]:
     return values | {address: one for address, one in units.items() if address not in values}
 
 
-Ask = Callable[[int, Address], Session[bytes]]
-
 _FIRST_S = 0.05  # between two questions to a node that has just been configured, or that is doubted
 _CLOSELY = 3  # questions for one doubted object that follow each other so
 _FOREIGN_S = 10.0  # of silence after an answer to somebody else's request
+_VALUE_BYTES = 8
 
 
 class ReadBack:
-    """Asks all nodes of one bus for their objects: new ones first, then values and units by turns."""
+    """Asks all nodes of one bus for their objects: new ones first, then values and units by turns.
 
-    def __init__(self, ask: Ask, period_s: float, check: ObjectCheck) -> None:
-        self._ask = ask
-        self._period_s = period_s
-        self._check = check
-        self._question: _Object | None = None  # until it is confirmed
-        self._session: Session[bytes] | None = None  # the question under way
-        self._asked = 0  # times, for the present object
-        self._unit = False  # whose turn it is
-        self._due_s = self._quiet_s = 0.0
+    Args:
+        run: makes the session of a program, whose requests are not repeated.
+    """
+
+    def __init__(
+        self, run: Callable[[Program[None]], Session[None]], period_s: float, check: ObjectCheck
+    ) -> None:
+        self._period_s, self._check = period_s, check
+        self._now_s = self._quiet_s = 0.0
+        self._session = run(self._questions())
 
     def quiet(self, now_s: float) -> None:
         """Ask nothing for a while: somebody else talks to a node."""
@@ -287,60 +287,48 @@ class ReadBack:
 
     def feed(self, node: int, data: bytes, now_s: float) -> None:
         """Take an SDO frame of a node."""
-        question, session = self._question, self._session
-        if session is None or session.done or question is None or question.node != node:
+        if self._session.asks != node:
             self.quiet(now_s)
         else:
-            session.feed(0x580 + node, data, now_s)
+            self._session.feed(0x580 + node, data, now_s)
 
     def step(self, now_s: float) -> None:
         """Let time pass."""
-        if self._question is not None and not self._check.watches(self._question):
-            self._question = self._session = None
-        question, session = self._question, self._session
-        if question is None or session is None:
-            if now_s >= max(self._due_s, self._quiet_s):
-                self._begin(now_s)
-            return
-        if not session.poll(now_s) or self._check.undecided(question):
-            return
-        self._session = None
-        try:
-            answered = bool(session.result)
-        except DriveError:  # it is busy, or has no such object any more: that says nothing
-            answered = False
-        if answered and question.doubts:
-            self._due_s = now_s + (_FIRST_S if self._asked < _CLOSELY else self._period_s)
-        else:
-            self._move_on(now_s)
-
-    def _begin(self, now_s: float) -> None:
-        if self._question is None:
-            self._question, self._asked = self._next(), 0
-        question = self._question
-        if question is None:
-            return
-        if not self._check.used(question.node):
-            self._move_on(now_s)
-            return
-        self._asked += 1
-        self._session = self._ask(question.node, question.address)
+        self._now_s = now_s
         self._session.poll(now_s)
 
-    def _next(self) -> _Object | None:
-        """An object that was never asked for, else the one of a kind that was so longest ago."""
-        objects = self._check.objects
-        new = next((one for one in objects if one.asked_s == -math.inf), None)
-        if new is not None:
-            return new
-        self._unit = not self._unit
-        kind = (one for one in objects if (one.mapped is None) == self._unit)
-        return min(kind, key=lambda one: one.asked_s, default=None)
+    def _questions(self) -> Program[None]:
+        wait_s, units = 0.0, False
+        for turn in count(1):
+            yield from self._wait(wait_s)
+            objects = self._check.objects
+            one = next((one for one in objects if not one.asked), None)
+            if one is None:
+                units = not units
+                kind = (one for one in objects if (one.mapped is None) == units)
+                one = min(kind, key=lambda one: one.asked, default=None)
+            if one is not None:
+                yield from self._confirm(one)
+                one.asked = turn
+            # Soon, where a configuration has still to be confirmed.
+            wait_s = self._period_s if all(one.asked for one in self._check.objects) else _FIRST_S
 
-    def _move_on(self, now_s: float) -> None:
-        """The next question: soon, where a configuration has still to be confirmed."""
-        if self._question is not None:
-            self._question.asked_s = now_s
-        self._question = self._session = None
-        soon = any(one.asked_s == -math.inf for one in self._check.objects)
-        self._due_s = now_s + (_FIRST_S if soon else self._period_s)
+    def _confirm(self, one: _Object) -> Program[None]:
+        """Ask for an object until its answers are no doubt, or its node is configured again."""
+        for times in count(1):
+            if not self._check.used(one.node):
+                return
+            try:
+                answer = yield Read(one.node, *one.address, most=_VALUE_BYTES)
+            except DriveError:  # it is busy, or has no such object any more: that says nothing
+                return
+            while self._check.undecided(one):
+                yield Pause(0.0)
+            if not answer or not one.doubts or not self._check.watches(one):
+                return
+            yield from self._wait(_FIRST_S if times < _CLOSELY else self._period_s)
+
+    def _wait(self, seconds: float) -> Program[None]:
+        yield Pause(seconds)
+        while self._now_s < self._quiet_s:
+            yield Pause(self._quiet_s - self._now_s)

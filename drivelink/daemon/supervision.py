@@ -80,7 +80,7 @@ class Supervisor:
         if section.read_back_s:
             samples = {node: watched.loop_joint.pipeline.history.after for node, watched in nodes.items()}
             self._check = check = ObjectCheck(section.sdo_timeout_s, samples)
-            self._read_back = ReadBack(configurator.ask, section.read_back_s, check)
+            self._read_back = ReadBack(configurator.run, section.read_back_s, check)
         for node in nodes:
             loop.listeners[0x580 + node] = self._answer
             loop.listeners[0x600 + node] = self._foreign_request

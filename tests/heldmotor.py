@@ -35,10 +35,7 @@ def moved(seconds, kp=KP, hand_rad=0.02):
         rate[0, 4] = PRESLIDING * (omega - abs(omega) * friction / SLIDING)
 
     plants = joints.Plants(
-        *joints.polynomial(np.array([[[K]]])),
-        *(B, D, M, 0.0, 0.0),
-        more=hand_and_friction,
-        memories=1,
+        *joints.polynomial(np.array([[[K]]])), *(B, D, M, 0.0, 0.0), more=hand_and_friction, memories=1
     )
     size = (round(seconds / kit.PERIOD_S), 1, 1)
     truth = joints.simulate(plants, controller, kit.PERIOD_S, 2, size=size, method=joints.HEUN)

@@ -5,16 +5,7 @@ from canopenkit import Item, Slave, Wire, drive_objects
 from drivelink.canopen.bus import run_program
 from drivelink.canopen.guard import ForbiddenFrameError, SilentBus, check_frame
 from drivelink.canopen.pdo import read_optional
-from drivelink.canopen.sdo import (
-    Nmt,
-    Pause,
-    Read,
-    SdoTimeout,
-    Session,
-    Write,
-    abort_text,
-    read_number,
-)
+from drivelink.canopen.sdo import Nmt, Pause, Read, SdoTimeout, Session, Write, abort_text, read_number
 from drivelink.errors import BusError, DriveError
 
 

@@ -1,15 +1,14 @@
 """Frames in, one sample per SYNC out: gaps, late and doubled frames, rolled-over counters, reboots."""
 
-import math
 import random
 
 import pytest
 from canlayouts import COUNT_RAD, LINK_RAD, VSA, drive, link, pdo, vsa_cycle
 
-from drivelink._core import LATE, Assembler, JointPipeline
+from drivelink._core import LATE, Assembler
 from drivelink.canopen.layout import NodeLayout, TpdoLayout
 from drivelink.errors import DriveError
-from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+from estimator.sample import Sample, Status
 
 SYNC = 0x080
 MS = 1_000_000
@@ -100,49 +99,6 @@ def test_a_forged_reading_does_not_leave_the_counter_a_turn_off():
         assert sample is None or sample.motor_position_rad[0] == (1000 + k) * COUNT_RAD
 
 
-def test_a_counter_is_followed_across_a_gap():
-    top = 2**31 - 10
-    assembler = Assembler((drive(1, 0),), 1)
-    run(assembler, [(SYNC, b""), (0x181, pdo(top))])
-    for _ in range(5):
-        assembler.feed(SYNC, b"")
-    assembler.feed(0x181, pdo(-(2**31) + 40))
-    sample = assembler.feed(SYNC, b"")
-    assert sample is not None
-    assert sample.motor_position_rad[0] == pytest.approx((top + 50) * COUNT_RAD, abs=1e-9)
-
-
-def test_a_rebooted_node_is_not_believed_before_it_is_started_again():
-    assembler = Assembler(VSA, 2)
-    run(assembler, [(SYNC, b""), *vsa_cycle(0)])
-    assembler.feed(0x702, b"\x00")
-    assert assembler.untrusted == (2,)
-    assert run(assembler, [(SYNC, b""), *vsa_cycle(1), (SYNC, b"")]) == []
-    assert (assembler.counters[2].reboots, assembler.counters[2].ignored) == (1, 1)
-    assembler.feed(0x702, b"\x05")  # operational by itself, with its default PDOs: not ours
-    assert assembler.untrusted == (2,)
-    assembler.feed(0x000, b"\x01\x02")
-    run(assembler, [(SYNC, b""), (0x181, pdo(3)), (0x182, pdo(777)), (0x183, link(3))])
-    sample = assembler.feed(SYNC, b"")
-    assert sample is not None
-    assert assembler.flags & Status.NODE_RESTARTED  # positions may have started anew
-    assert sample.motor_position_rad[1] == pytest.approx(777 * COUNT_RAD)
-    run(assembler, vsa_cycle(4))
-    assembler.feed(SYNC, b"")
-    assert not assembler.flags & Status.NODE_RESTARTED
-
-
-def test_no_zero_is_believed_while_a_homing_runs_and_its_end_is_told():
-    assembler = Assembler(VSA, 2)
-    homing, found = 0x602, []
-    words = (0x1237, 0x0237, 0x0237, 0x2237, 0x0237, 0x1637, 0x1637, 0x1637)  # attained at the sixth
-    for k, word in enumerate(words):
-        request = [(homing, bytes.fromhex("2F60600006000000"))] if k == 1 else []
-        run(assembler, [(SYNC, b""), *request, (0x181, pdo(k)), (0x182, pdo(-k, 0, word)), (0x183, link(k))])
-        found.append(bool(assembler.flags & Status.NODE_RESTARTED))
-    assert found == [False, True, True, True, True, True, False, False]
-
-
 @pytest.mark.parametrize(("silent", "lost"), [(10, False), (11, True)])
 def test_a_node_that_was_not_heard_for_a_while_may_count_from_elsewhere(silent, lost):
     assembler = Assembler(VSA, 2, active=False, hold_periods=10)
@@ -182,24 +138,6 @@ def test_a_passive_listener_takes_no_start_for_a_mapping():
     for node in (1, 2, 3):
         assembler.trust(node)
     assert len(run(assembler, [(SYNC, b""), *vsa_cycle(1)])) == 1
-
-
-def test_a_drive_fault_is_flagged_by_statusword_and_by_emcy():
-    assembler = Assembler(VSA, 2)
-    run(assembler, [(SYNC, b""), (0x181, pdo(0, statusword=0x0218)), *vsa_cycle(0)[1:]])
-    assert assembler.flags == Status.DRIVE_FAULT
-    assert assembler.faults == {1: 0}
-    for word in (0x0237, 0x0637, 0x0237):  # a bit that toggles is no fault
-        run(assembler, [(SYNC, b""), (0x181, pdo(1, 1, statusword=word)), *vsa_cycle(1)[1:]])
-        assert assembler.flags == 0
-    assembler.feed(0x082, bytes.fromhex("1023 01 0000000000".replace(" ", "")))
-    run(assembler, [(SYNC, b""), *vsa_cycle(2)])
-    assert assembler.flags == Status.DRIVE_FAULT
-    assert assembler.faults == {2: 0x2310}
-    assembler.feed(0x082, bytes(8))
-    run(assembler, [(SYNC, b""), *vsa_cycle(3)])
-    assert assembler.flags == 0
-    assert assembler.counters[2].emergencies == 1
 
 
 def test_every_second_sync_gives_every_second_sample():
@@ -243,19 +181,3 @@ def test_the_answers_to_a_late_sync_are_of_no_sample_and_spoil_none():
         assert sum(sample is not None for sample in found) == samples
         assert assembler.flags == 0
     assert assembler.sequence == 4
-
-
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
-def test_what_is_not_a_number_is_never_valid_on_the_wire(number):
-    class Says:
-        external = None
-
-        def step(self, sample: Sample) -> Estimate:
-            part = TransmissionEstimate(*numbers, 0.1)
-            return Estimate(sample.sequence, int(Status.VALID), *numbers, (part,))
-
-    pipeline = JointPipeline(Assembler((), 0), Says())
-    sample = Sample(0, (0.0,), (math.nan,), (0.0,), 0.0)
-    for place in (None, 0, 1):
-        numbers = [number if k == place else 1.0 for k in range(3)]
-        assert bool(pipeline.take(sample).status & Status.VALID) == (place is None)

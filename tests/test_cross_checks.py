@@ -4,11 +4,9 @@ import math
 import struct
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 from canlayouts import COUNT_RAD, drive, mapped
 from daemonkit import DaemonRig, rig, vsa
-from scipy.signal import lfilter
 
 from drivelink._core import Assembler
 from drivelink.canopen.layout import NodeLayout, Signal, TpdoLayout
@@ -166,48 +164,3 @@ def test_a_following_error_that_is_not_demand_less_position_is_found():
     assert not any(f & Status.CONTRADICTED for f in feed(assembler, 0, 20_000, truth))
     assert [check[1:3] for check in assembler.checks] == [("following_error", "agrees")]
     assert feed(assembler, 20_000, 1000, lambda t: truth(t, 0.0))[-1] & Status.CONTRADICTED
-
-
-def awkward_motion(rng: np.random.Generator, samples: int) -> np.ndarray:
-    """Velocity in rad/s: rests, slow and fast motion, reversals at once and noise follow one another."""
-    velocity, k = np.zeros(samples), 0
-    while k < samples:
-        t = np.arange(rng.integers(500, 6000)) * 1e-3
-        part = (
-            np.zeros(len(t)),
-            rng.uniform(0.05, 0.5) * np.sin(math.tau * rng.uniform(0.2, 1.0) * t),
-            rng.uniform(1.0, 6.0) * np.sin(math.tau * rng.uniform(1.0, 8.0) * t),
-            rng.uniform(-2.0, 2.0) * np.sign(np.sin(math.tau * rng.uniform(1.0, 4.0) * t)),
-            np.convolve(rng.normal(0.0, 3.0, len(t)), np.ones(40) / 40, "same"),
-        )[rng.integers(5)]
-        velocity[k : k + len(t)] = part[: samples - k]
-        k += len(t)
-    return velocity
-
-
-@pytest.mark.parametrize(
-    ("lag_s", "step_rad_s", "noise_nm"), [(0.004, 0.002, 0.02), (0.02, 0.01, 0.2), (0.005, 0.1, 0.5)]
-)
-def test_lag_coarse_steps_noise_rests_and_impacts_contradict_nothing(lag_s, step_rad_s, noise_nm):
-    """A velocity that is filtered and cut off, a current with noise of its own and another ratio; 100 s."""
-    rng, samples = np.random.default_rng(round(1e4 * lag_s)), 100_000
-    velocity = awkward_motion(rng, samples)
-    position = np.cumsum(velocity) * 1e-3
-    keep = math.exp(-1e-3 / lag_s)
-    filtered = lfilter([1.0 - keep], [1.0, -keep], velocity)
-    torque = np.clip(20.0 * np.gradient(velocity) + 0.3 * np.sign(velocity) + 0.5 * velocity, -25.0, 25.0)
-    current = 1.7 * torque + noise_nm * rng.normal(size=samples)
-    assembler = listening((Signal.VELOCITY_CHECK, 0x606C, step_rad_s), (Signal.TORQUE_CHECK, 0x6078, 1e-3))
-    for p, v, i, c in zip(
-        np.rint(position / COUNT_RAD).astype(int).tolist(),
-        np.trunc(filtered / step_rad_s).astype(int).tolist(),
-        np.rint(torque / 1e-3).astype(int).tolist(),
-        np.rint(current / 1e-3).astype(int).tolist(),
-        strict=True,
-    ):
-        assembler.feed(SYNC, b"")
-        assembler.feed(0x181, struct.pack("<ihH", p, i, 0x27))
-        assert not assembler.flags & Status.CONTRADICTED
-        assembler.feed(0x281, struct.pack("<ii", v, c))
-    assert {check[2] for check in assembler.checks} == {"agrees"}
-    assert assembler.checks[1][3] == pytest.approx(1.7, rel=0.01)

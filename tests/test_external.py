@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import onlinekit
 import pytest
-from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
 
 from drivelink import jointfile
 from drivelink._core import Assembler, JointPipeline
@@ -150,35 +148,6 @@ def test_it_is_valid_where_the_estimate_is_and_its_standard_deviation_is_that_of
     assert np.sqrt(np.mean(off**2)) > 0.1
 
 
-def test_what_a_late_sync_does_to_the_positions_is_no_contact_and_pushes_are_found_beside_it(pushed):
-    """Every 200th SYNC is late by up to a period: true motion, read later."""
-    rng = np.random.default_rng(1)
-    t = T * np.arange(len(pushed["time_s"]))
-    late = np.where(rng.random(t.size) < 0.005, rng.uniform(0.0, T, t.size), 0.0)
-    read = {
-        name: CubicSpline(t, pushed[name])(t + late) for name in ("motor1_position_rad", "link_position_rad")
-    }
-    free, after = (
-        slice(LEARNED, round(PUSHES[0][0] / T)),
-        [round((begin + PUSH_S) / T) for begin, _ in PUSHES],
-    )
-    contact, most = {}, {}
-    for told in (False, True):
-        estimator = make_estimator(model(), EstimatorSettings(contact_torque_nm=0.2), T)
-        pipeline = JointPipeline(Assembler((), 0), estimator)
-        late_ns = (told * late * 1e9).astype(int).tolist()
-        external = [
-            pipeline.take(sample, late_ns=ns).external
-            for sample, ns in zip(samples(pushed | read), late_ns, strict=True)
-        ]
-        contact[told] = np.array([one.status & CONTACT > 0 for one in external])
-        valid = [one for one in external[free] if one.status & VALID]
-        most[told] = max(abs(one.external_torque_nm) / one.external_torque_std_nm for one in valid)
-    assert most[True] < 1.96 < most[False]
-    assert not contact[True][: free.stop].any()
-    assert all(contact[True][end - round(PUSH_S / T) : end].any() for end in after)
-
-
 @pytest.mark.parametrize("error", [0.02, -0.05, 0.10])
 def test_a_link_that_is_off_by_what_is_declared_raises_no_contact(free, error):
     link = replace(
@@ -212,11 +181,6 @@ def test_a_motor_that_friction_stops_is_not_suspected_of_a_frozen_reading():
         estimator.step(sample)
         suspicion = estimator.suspicion()
         assert suspicion is None or suspicion["reason"] != "frozen", sample.sequence
-
-
-def test_friction_at_the_link_below_the_least_torque_is_no_contact():
-    rows = record(world(seed=3, effects=("link_coulomb_friction=0.3",)), 14.0)
-    assert not Estimates(model(), rows, contact_torque_nm=0.7).contact.any()
 
 
 def test_a_bias_takes_a_payload_in_and_lets_a_lasting_push_fade():
@@ -274,19 +238,6 @@ def test_the_flexibility_torque_from_the_link_side_is_the_true_one(pushed):
     consistency = estimated.estimator.consistency
     # its ten seconds begin while the spring is known to a tenth
     assert consistency.difference_rms_nm < 0.1 * consistency.link_flexibility_torque_rms_nm
-
-
-def test_mode_paper_has_equation_13_and_the_same_external_torque(pushed):
-    """-r of eq 12 is tau_e,t through K/(s + K); noise of the differenced position is averaged away over 50 ms."""
-    estimated = Estimates(model(), pushed, measured=True, mode="paper", k_tau_rad_s=100.0)
-    a = math.exp(-100.0 * T)
-    truth = lfilter([1.0 - a], [1.0, -a], pushed["truth_flexibility_torque_nm"])
-    smooth = np.ones(50) / 50
-    off = np.convolve(estimated.link_torque - truth, smooth, "same")[1000:-1000]
-    assert np.sqrt(np.mean(off**2)) < 0.02 * np.sqrt(np.mean(truth**2))
-    # The motor's dry friction is in tau_e of eq 14, and so in the external torque: no better than that.
-    push_found = np.mean(estimated.torque[round(11.1 / T) : round(11.4 / T)])
-    assert push_found == pytest.approx(-3.0, abs=0.75 + 0.3)
 
 
 def test_nothing_is_said_where_nothing_is_declared_and_a_rigid_transmission_reveals_nothing(free):

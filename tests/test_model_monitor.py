@@ -65,13 +65,6 @@ def test_an_effect_raises_the_alarm_and_its_place_is_named(effect, runs, monitor
     assert effect != "coulomb_nm" or 0.25 < monitor.residual_nm[0] < 0.45
 
 
-def test_what_the_link_alone_does_is_no_alarm_where_nobody_measures_what_touches_it(runs, fitted, monitor):
-    """It may be a push, and says nothing against the flexibility torque: the external torque shows it."""
-    assert not any(_play(monitor, runs["gravity_nm"]))
-    assert monitor.residual_nm[1] > 2.0 * fitted[1].residual_nm[1]
-    assert any(_play(monitor, runs["coulomb_nm"], first=len(runs["gravity_nm"])))
-
-
 def test_the_alarm_ends_when_the_effect_is_gone(runs, monitor):
     assert _play(monitor, runs["coulomb_nm"])[-1]
     assert not _play(monitor, runs["again"], first=len(runs["again"]) + 100)[-1]

@@ -95,15 +95,6 @@ def test_a_view_without_anything_yet_says_so():
     assert "no baseline: drivelink fit" in text and "● observable" in text and "not observable" not in text
 
 
-def test_what_is_not_finite_breaks_nothing():
-    view = JointView("elbow")
-    one = TransmissionEstimate(*[math.nan] * 4)
-    for k in range(100):
-        view.update(Estimate(k, 0, *[math.nan] * 3, (one,)), k * 1e-3)
-    assert "not valid" in "\n".join(lines(view)) and "nan" not in view.line()
-    assert json.dumps(snapshot(view, True, {}), allow_nan=False)
-
-
 def test_the_view_shows_what_touches_the_link_where_that_is_known():
     view = filled()
     assert not any(line.startswith("│ external") for line in lines(view))

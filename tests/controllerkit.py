@@ -43,17 +43,19 @@ class Rig:
 
     Attributes:
         now_s: bus time.
-        commands: (time, identifier, per mille) of each torque on the bus.
+        sent: (identifier, data) of each frame of the controller.
+        commands: (time, identifier, per mille) of each torque among them.
         events: (phase, reason, age of the last estimate) of the controller.
         cut: nothing reaches the controller over zenoh.
     """
 
-    def __init__(self, settings: Settings = QUICK, channel: str | None = None) -> None:
-        joint = jointfile.parse(declared_text())
+    def __init__(self, settings: Settings = QUICK, channel: str | None = None, text: str = "") -> None:
+        joint = jointfile.parse(text or declared_text())
         where = {"interface": "socketcan" if channel else "virtual", "options": {}}
         bus = joint.bus.model_copy(update={**where, "channel": channel or f"vsa-{next(_channels)}"})
         self.joint = joint.model_copy(update={"bus": bus})
         self.now_s = self.last_estimate_s = 0.0
+        self.sent: list[tuple[int, bytes]] = []
         self.commands: list[tuple[float, int, int]] = []
         self.events: list[tuple[str, str, float]] = []
         self.cut, self.external, self._estimates, self._samples, self._count = False, None, [], [], 0
@@ -97,6 +99,7 @@ class Rig:
 
     def send(self, message: can.Message) -> None:
         """The controller's frames; devices answer at once, so that its SDO transfers need no waiting."""
+        self.sent.append((message.arbitration_id, bytes(message.data)))
         if 0x200 < message.arbitration_id <= 0x57F:
             torque = int.from_bytes(message.data[2:4], "little", signed=True)
             self.commands.append((self.now_s, message.arbitration_id, torque))

@@ -3,8 +3,10 @@
 Each rig takes some seconds of simulation to get moving, so a test goes through a fault and its recovery.
 """
 
+import itertools
 import math
 import time
+from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,6 +14,7 @@ import controllerkit as kit
 import pytest
 import run as program
 from controller import Controller, Cycle, Settings, deflections
+from drives import MOST_RESETS
 
 from drivelink import jointfile
 from drivelink._core import encode_sample
@@ -106,6 +109,58 @@ def test_a_wall_is_not_leant_on():
         assert rig.run(0.08, "react"), rig.events
         rig.run(0.45)
         assert 3.0 * side * (rig.world.truth().link_position_rad - q) < 0.06
+
+
+def test_drives_are_set_up_enabled_and_commanded_by_the_controllers_own_objects_alone(capsys):
+    text = kit.declared_text().replace("[motor.drive]", "[motor.drive]\ndirection = -1", 1)
+    with closing(kit.Rig(text=text)) as rig:
+        first, second, _ = rig.network.nodes
+        number = lambda node, index, subindex=0: node.dictionary.find(index, subindex).number  # noqa: E731
+        tpdos = [number(first, 0x1800 + n, s) for n in range(4) for s in (1, 2)]
+        rig.master.command((0.1, 0.1), 0.0)
+        assert [cob for cob, _ in rig.sent] == [0x77E]  # before the set-up there is the heartbeat only
+        assert rig.run(4.0, "identify") and rig.master.states["enabled"]
+        rig.master.command((0.02, 5.0), rig.now_s)
+        rig.network.poll()
+        unit_nm, most = rig.master.drives[0].unit_nm, number(second, 0x6072)
+        assert number(first, 0x6071) == -round(0.02 / unit_nm)  # against the joint's sign
+        assert number(second, 0x6071) == most == round(QUICK_NM / unit_nm)  # limited here and in the drive
+        assert (number(first, 0x6061), number(first, 0x1402, 2)) == (10, 255)  # cyclic synchronous torque
+        assert written(rig) <= {0x1402, 0x1602, 0x6071, 0x6072, 0x6060, 0x1016, 0x1029, 0x6007}
+        assert tpdos == [number(first, 0x1800 + n, s) for n in range(4) for s in (1, 2)]
+        assert not any(cob in (0x000, 0x080) for cob, _ in rig.sent)  # no NMT, no SYNC
+        rig.sent.clear()
+        rig.master.drives[0].forget()  # a mapping that is there already is not written
+        rig.run(0.1)
+        assert rig.master.states["enabled"] and not written(rig) & {0x1402, 0x1602}
+        for drive in rig.master.drives:
+            drive.forget()
+            drive._node.sdo.RESPONSE_TIMEOUT = 0.01
+        rig.network.plugged = False
+        rig.master.set_up(rig.now_s)
+        assert "node 1: No SDO response received\n" in capsys.readouterr().err
+
+
+QUICK_NM = kit.QUICK.torque_nm
+
+
+def written(rig) -> set[int]:
+    """Indices of the objects that were written by SDO."""
+    frames = (data for cob, data in rig.sent if 0x600 < cob < 0x680 and data[0] >> 5 == 1)
+    return {int.from_bytes(data[1:3], "little") for data in frames}
+
+
+def test_a_fault_that_comes_back_at_once_is_reset_by_edges_and_not_for_ever():
+    with kit.running() as rig:
+        drive = rig.network.nodes[0]
+        rig.sent.clear()
+        for _ in range(900):
+            if drive.machine.state is not PowerState.FAULT:
+                drive.fault(0x2310)
+            rig.step()
+        words = [data[0] for cob, data in rig.sent if cob == 0x401]
+        edges = sum(1 for a, c in itertools.pairwise(words) if c & 0x80 and not a & 0x80)
+        assert 1 <= edges <= MOST_RESETS
 
 
 # Without a rig: what the controller makes of single cycles.

@@ -151,6 +151,12 @@ def test_a_drive_without_a_mapping_that_serves_is_one_line(slave, said, monkeypa
     monkeypatch.setattr("drivelink.canopen.node.BOOT_S", 0.1)
     with pytest.raises(DriveError, match=said):
         configured(slave())
+    blind = drive()
+    del blind.objects[0x60E4, 1]
+    with pytest.raises(
+        DriveError, match=r"node 5 \(motor\[1\]\.drive\) gives no link_position: it has no 0x60E4:01"
+    ):
+        configured(blind, link="[link.encoder]\ncounts_per_rev = 4096")
 
 
 def test_two_tpdos_with_one_identifier_are_distinguished():

@@ -91,22 +91,6 @@ def test_a_second_joint_on_the_interface_keeps_its_network_file(joint, tmp_path)
     assert not (root / NETWORK).exists()
 
 
-@pytest.mark.parametrize(
-    ("interface", "channel", "words", "message"),
-    [
-        ("virtual", "x", [], "lives inside one process"),
-        ("socketcan", "can0/../x", [], "expected the name of a network interface"),
-        ("socketcan", "can0", ["--allow", "everybody"], "expected an address like"),
-        ("socketcan", "can0", ["--credential", "key"], "expected NAME=FILE"),
-    ],
-)
-def test_what_cannot_be_a_service_is_one_line(tmp_path, capsys, interface, channel, words, message):
-    path, root = written(tmp_path, interface, channel), tmp_path / "root"
-    assert service("install", path, "--root", root, *words) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1 and not root.exists()
-
-
 def test_a_home_installation_is_let_in_and_keys_come_as_credentials(monkeypatch):
     """The unit sees nothing below /home but these, and they read-only."""
     monkeypatch.setattr("sys.prefix", "/home/eva/venv")

@@ -208,13 +208,6 @@ def test_a_slow_sine_decides_nothing():
     assert found.verdict == "insufficient_excitation"
 
 
-@pytest.mark.slow
-def test_a_validation_recording_takes_no_part(records):
-    (other,) = kit.World([{"coulomb_nm": 0.4}], seed=9).run()
-    found = diagnose(records["coulomb"], kit.model(), validation=other)
-    assert found.validation.after_relative < 0.1 * found.validation.before_relative
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -227,14 +220,6 @@ def test_a_validation_recording_takes_no_part(records):
 def test_a_fault_of_installation_is_one_line(change, message, records):
     with pytest.raises(EstimatorError, match=message):
         diagnose(change(records["clean"]), kit.model())
-
-
-@pytest.mark.slow
-def test_gaps_are_left_out(records):
-    keep = np.ones(len(records["coulomb"]), dtype=bool)
-    keep[3000:3040] = keep[9000:9300] = False
-    holed = joints.part(records["coulomb"], keep)
-    assert [e.name for e in diagnose(holed, kit.model()).effects] == ["coulomb_friction"]
 
 
 @pytest.mark.parametrize(

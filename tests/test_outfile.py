@@ -129,7 +129,7 @@ def test_a_full_disk_leaves_what_was_there(folder):
 def test_a_kill_at_any_moment_leaves_the_old_file_or_the_new_one(tmp_path):
     path, rng = tmp_path / "a.txt", np.random.default_rng(1)
     path.write_text("a" * 200_000)
-    for _ in range(6):
+    for _ in range(3):
         with zenohkit.python("-c", AGAIN, path) as process:
             assert process.stdout.readline()
             time.sleep(rng.uniform(0.0, 0.02))
@@ -161,10 +161,10 @@ def test_a_recording_takes_the_place_of_another_one_with_its_first_block(folder)
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Eight seconds of a linear joint, as CSV."""
+    """Four seconds of a linear joint, as CSV."""
     rng = np.random.default_rng(5)
     plants = joints.Plants(*joints.polynomial(np.array([[[100.0]]])), 0.5, 0.8, 0.4, 0.2, 5.0)
-    truth = joints.simulate(plants, joints.sweep(rng, 8000, 1, 1, 0.001, 8.0, 3.0), 0.001)
+    truth = joints.simulate(plants, joints.sweep(rng, 4000, 1, 1, 0.001, 8.0, 3.0), 0.001)
     record = joints.record(truth, 0, 0.001)
     return joints.write_csv(record, tmp_path_factory.mktemp("data") / "r.csv").read_bytes()
 

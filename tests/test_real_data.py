@@ -6,7 +6,6 @@ Skipped where the recordings are not there: `../shared/data` beside the project,
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from drivelink import jointfile, recording
@@ -40,20 +39,3 @@ def test_kuka_axes_have_friction_and_get_better_on_the_other_recording(axis, lim
     assert found.validation.after_relative < limit  # thirty lines of least squares: 23.7 % and 35.0 %
     assert found.validation.after_rms_nm < found.validation.before_rms_nm
     assert any("friction" in effect.name for effect in found.effects)
-
-
-@pytest.mark.slow
-def test_two_recordings_of_a_machine_find_what_belongs_to_it():
-    """The authors regress 2.6 to 2.9 ms of skew between the encoders; what each tells alone agrees with that."""
-    declared = jointfile.load(ROOT / "examples" / "kuka_axis3.toml")
-    a, b = (recording.read(DATA / f"kuka_kr300/axis3_{name}.csv", declared) for name in "AB")
-    both = diagnose([a, b], declared.model(), 15.0)
-    assert both.alignment["link_position_delay_s"] == pytest.approx(2.6e-3, abs=3e-4)
-    (together,) = both.transmissions
-    each = [diagnose(one, declared.model(), 15.0).transmissions[0] for one in (a, b)]
-    assert any(one.parameters for one in each)  # one alone may not determine its stiffness
-    for one in (one for one in each if one.parameters):
-        difference = one.parameters["k_nm_rad"] - together.parameters["k_nm_rad"]
-        assert abs(difference) < 3.0 * np.hypot(one.std["k_nm_rad"], together.std["k_nm_rad"])
-    assert len(both.recordings) == 2
-    assert all(one.validation is not None for one in both.recordings)

@@ -31,30 +31,6 @@ def test_a_controlword_leads_where_the_standard_says(state, word):
     assert made.state is TABLE[state, word]
 
 
-@pytest.mark.parametrize("state", [P.FAULT, P.FAULT_REACTION])
-def test_no_controlword_without_bit_7_leads_out_of_a_fault(state):
-    made = machine(state)
-    for word in range(0x80):
-        made.control(word)
-        assert made.state is state, word
-
-
-@pytest.mark.parametrize("state", [s for s in P if s not in (P.FAULT, P.FAULT_REACTION, P.NOT_READY)])
-def test_a_fault_runs_through_its_reaction_and_is_reset_by_an_edge(state):
-    made = machine(state)
-    made.fault()
-    made.control(0x80)
-    assert made.state is P.FAULT_REACTION
-    made.step()
-    assert made.state is P.FAULT
-    assert [made.control(word) for word in (0x80, 0x00, 0x80)] == [
-        False,
-        False,
-        True,
-    ]  # bit 7 was set already
-    assert made.state is P.SWITCH_ON_DISABLED
-
-
 def test_quick_stop_ends_disabled_or_stays_as_its_option_says():
     for option in range(9):
         made = machine(P.QUICK_STOP_ACTIVE)

@@ -102,6 +102,7 @@ def test_a_recording_has_the_contracts_columns_and_the_truth():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: case("d"), 'expected one of constant, quadratic, vsa-ii, got "d"'),
         (lambda: with_parameters(sea(motors=2), {"lever_per_rad": 0.8}), "lever_per_rad: unknown"),
         (lambda: world(plant_step_s=0.0007), "plant_step_s: expected a whole fraction of the period 0.001 s"),
         (lambda: world(period_s=0.0), "period_s: expected a number > 0"),

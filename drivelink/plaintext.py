@@ -34,21 +34,29 @@ def _shown(character: str) -> str:
 # What stands for a character where the terminal's encoding lacks it; others become "?".
 _SPELT = {
     "±": "+/-", "·": "*", "×": "x", "µ": "u", "−": "-", "–": "-", "→": "->", "…": "...", "°": " deg",
-    "φ": "phi", "θ": "theta", "²": "^2", "³": "^3", "≤": "<=", "≥": ">=", "✓": "ok", "✗": "x", "●": "*",
-    "█": "#", "░": ".", "⁻": "^-",
+    "φ": "phi", "θ": "theta", "σ": "sigma", "τ": "tau", "π": "pi", "Ω": "Ohm", "≤": "<=", "≥": ">=", "✓": "+",
+    "✗": "x", "●": "*", "▶": ">", "█": "#", "░": ".", "⁻": "^-",
+    **{raised: f"^{digit}" for digit, raised in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")},
 }  # fmt: skip
 
 
-def _spelt(error: UnicodeError) -> tuple[str, int]:
+def _replaced(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]
     return "".join(_SPELT.get(character, "?") for character in lacking), error.end
 
 
+codecs.register_error("drivelink.spelt", _replaced)
+
+
+def spelt(text: str, encoding: str) -> str:
+    """Return the text with characters that the encoding lacks spelt out: before anything is aligned."""
+    return text.encode(encoding, "drivelink.spelt").decode(encoding)
+
+
 def spell_out() -> None:
     """Make stdout and stderr spell out characters that their encoding lacks: a C locale, a serial console."""
-    codecs.register_error("drivelink.spelt", _spelt)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="drivelink.spelt")

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,25 @@ def test_a_console_without_unicode_gets_the_words_spelt_out(fleet):
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert "Traceback" not in done.stderr and "N*m rms left" in done.stdout and done.stdout.isascii()
+    assert "?" not in done.stdout
+    for drawn, table in groupby(done.stdout.splitlines(), lambda line: line.startswith(("|", "+"))):
+        assert not drawn or len({len(line) for line in table}) == 1
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_help_fits_its_terminal(verb, monkeypatch):
+    for columns in (80, 120):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        text = cli._verb_parser(cli.make_parser([verb]), verb).format_help()
+        assert max(map(len, text.splitlines())) <= columns, verb
+
+
+def test_a_joint_s_name_is_not_its_file(capsys, monkeypatch):
+    monkeypatch.setattr("drivelink.pubsub.clientbase.joints", lambda: ["elbow"])
+    assert main(["record", "elbow", "--out", "elbow.mcap"]) == main(["keep", "knee"]) == 2
+    served, unknown = capsys.readouterr().err.splitlines()
+    assert 'a daemon serves "elbow": expected the joint file that it was started with' in served
+    assert "expected a joint file, such as elbow.toml" in unknown
 
 
 def _numeric(verb):

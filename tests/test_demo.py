@@ -18,12 +18,14 @@ from drivelink import cli, jointfile
 from drivelink._core import Tick
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.closedloop import STEPS
-from drivelink.demo.closing import Comparison, as_json, closing_table
+from drivelink.demo.closing import Comparison, as_json
+from drivelink.demo.closing import closing as closing_section
 from drivelink.demo.rig import RunSummary
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.demo.watching import DemoRun
 from drivelink.monitor.history import TruePoint
+from drivelink.output.document import show
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Status, TransmissionEstimate
 
@@ -96,7 +98,7 @@ SUMMARY = RunSummary(1200, 1150, 3, 180.0, 40.0, "")
 
 def closing(comparison: Comparison) -> str:
     console = Console(width=100, record=True, file=io.StringIO())
-    console.print(closing_table("vsa-ii", comparison, SUMMARY, 1150, 1e-3))
+    show([closing_section("vsa-ii", comparison, SUMMARY, 1150, 1e-3)], console)
     return console.export_text()
 
 

@@ -154,13 +154,17 @@ def test_too_short_a_look_and_a_joint_at_rest_are_no_judgement():
     (finding,) = live(seconds=1.0).notices
     assert finding.severity is Severity.INFO and "too short" in finding.text
     assert "the joint moves: look longer" in finding.fix  # it is not told to move what moves
-    still, section = np.zeros((9000, 1)), Section("Units and signs")
-    record = Record(
-        period_s=1e-3, sequence=np.arange(9000), motor_position_rad=still, motor_torque_nm=still,
-        link_position_rad=still[:, 0],
-    )  # fmt: skip
-    judge_record(section, parse(joint_on("still")), record)
-    assert "move the joint during the check" in section.notices[0].fix
+    section = Section("Units and signs")
+    for sequence in (np.arange(9000), np.arange(9000) * 2):
+        still = np.zeros((9000, 1))
+        record = Record(
+            period_s=1e-3, sequence=sequence, motor_position_rad=still, motor_torque_nm=still,
+            link_position_rad=still[:, 0],
+        )  # fmt: skip
+        judge_record(section, parse(joint_on("still")), record)
+    at_rest, busy = section.notices
+    assert "move the joint during the check" in at_rest.fix
+    assert "samples are missing" in busy.text and busy.fix.startswith("this machine is too busy")
 
 
 def test_a_bus_that_may_not_be_touched_is_judged_by_its_frames():

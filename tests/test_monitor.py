@@ -268,6 +268,15 @@ def test_a_joint_that_nobody_serves_is_not_live_and_the_nearest_is_named(daemon,
     assert displayed["state"] == 'no daemon of "elbwo"; did you mean "elbow"? there is elbow'
 
 
+def test_plain_lines_repeat_nothing_and_end_where_nobody_serves_the_joint(daemon, capsys, monkeypatch):
+    monkeypatch.setattr("drivelink.cli.monitor._ABSENT_S", 2.0)
+    assert cli.main(["monitor", "elbwo", "--endpoint", daemon, "--every", "0.1"]) == 6
+    said = capsys.readouterr()
+    lines = [line.split(" ", 1)[1] for line in said.out.splitlines()]
+    assert len(lines) == len(set(lines)) <= 2 and lines[0] == "elbwo: no estimate yet"
+    assert said.err.startswith("drivelink monitor: no ") and said.err.count("\n") == 1
+
+
 def test_a_daemon_that_is_silent_or_gone_leaves_no_green_and_no_live_numbers():
     view = filled()
     view.silent_s = 3.0

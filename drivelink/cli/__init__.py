@@ -12,15 +12,18 @@ import importlib
 import logging
 import math
 import os
+import re
 import signal
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import groupby
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol
 
-from drivelink.errors import DrivelinkError, UsageError
+from drivelink.errors import DrivelinkError, JointFileError, UsageError
 from drivelink.plaintext import PlainFormatter, clean_text, spell_out
 from drivelink.version import __version__
 from estimator.errors import EstimatorError
@@ -61,9 +64,38 @@ first steps:
   drivelink demo                   everything at once, without hardware
   drivelink new elbow.toml         a joint file for your own joint
   drivelink doctor elbow.toml      what is still in the way, and the fix
-  drivelink run elbow.toml         the daemon; then, elsewhere: drivelink monitor elbow
+  drivelink run elbow.toml         the daemon
+  drivelink monitor elbow          what it publishes, in another terminal
+
 `drivelink VERB --help` explains a verb, with examples.
 """
+
+
+class _Help(argparse.HelpFormatter):
+    """Folds an epilog: prose, and examples with their explanations, beside them where all have room."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines: list[str] = []
+        for example, block in groupby(
+            text.splitlines(), lambda line: line.startswith("  ") if line else None
+        ):
+            if example:
+                pairs = [(*re.split(" {2,}", line.strip(), maxsplit=1), "")[:2] for line in block]
+                column = 5 + max(len(command) for command, _ in pairs)
+                if all(column + len(about) <= width for _, about in pairs):
+                    lines += [f"  {command:{column - 2}}{about}".rstrip() for command, about in pairs]
+                    continue
+                for command, about in pairs:
+                    parts = textwrap.wrap(
+                        command, width - 4, subsequent_indent=" " * 4, break_on_hyphens=False
+                    )
+                    lines.append(" \\\n".join(f"  {part}" for part in parts))
+                    lines += textwrap.wrap(about, width, initial_indent=" " * 6, subsequent_indent=" " * 6)
+            elif example is None:
+                lines += block
+            else:
+                lines += textwrap.wrap(" ".join(block), width, break_on_hyphens=False)
+        return "\n".join(lines)
 
 
 class Verb(Protocol):
@@ -84,9 +116,9 @@ def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
     """Return the parser; only the modules of the given verbs are imported and configured."""
     parser = argparse.ArgumentParser(
         prog="drivelink",
-        description=sys.modules["drivelink"].__doc__,
+        description=(sys.modules["drivelink"].__doc__ or "").partition("\n")[0],
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=_Help,
     )
     parser.add_argument("--version", action="version", version=f"drivelink {__version__}")
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
@@ -95,7 +127,7 @@ def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
             name,
             help=summary,
             description=summary[0].upper() + summary[1:] + ".",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            formatter_class=_Help,
         )
         if name in verbs:
             module: Verb = importlib.import_module(f"drivelink.cli.{name}")  # type: ignore[assignment]
@@ -133,7 +165,7 @@ def _main(argv: list[str] | None) -> int:
             _verb_parser(parser, verb).error(f"unrecognized arguments: {' '.join(unknown)}")
         return int(args.run(args))
     except DrivelinkError as error:
-        return _fail(verb, error, error.exit_status)
+        return _fail(verb, f"{error}{_instead_of_a_name(error)}", error.exit_status)
     except EstimatorError as error:
         return _fail(verb, error, 1)
     except BrokenPipeError:
@@ -271,6 +303,22 @@ def handling(
     finally:
         for number, old in before.items():
             signal.signal(number, old)
+
+
+def _instead_of_a_name(error: DrivelinkError) -> str:
+    """What to give where a joint file is expected and a joint's name was given; empty where none was."""
+    cause = error.__cause__
+    if not (isinstance(error, JointFileError) and isinstance(cause, FileNotFoundError)):
+        return ""
+    name = str(cause.filename)
+    if "/" in name or Path(name).suffix:
+        return ""
+    from drivelink.pubsub.clientbase import joints
+
+    with suppress(DrivelinkError):
+        if name in joints():
+            return f'; a daemon serves "{name}": expected the joint file that it was started with'
+    return "; expected a joint file, such as elbow.toml"
 
 
 def _fail(verb: str, error: object, status: int) -> int:

@@ -9,8 +9,9 @@ import shtab
 from drivelink import cli
 
 EPILOG = """\
-bash:  drivelink completion bash > ~/.local/share/bash-completion/completions/drivelink
-zsh:   drivelink completion zsh > ~/.zfunc/_drivelink      (with ~/.zfunc in fpath)
+examples:
+  drivelink completion bash > ~/.local/share/bash-completion/completions/drivelink
+  drivelink completion zsh > ~/.zfunc/_drivelink   with ~/.zfunc in fpath
 """
 
 

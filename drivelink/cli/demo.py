@@ -16,9 +16,10 @@ from drivelink import jointfile
 from drivelink.cli import add_number
 from drivelink.cli.blackbox import black_box
 from drivelink.demo import closedloop
-from drivelink.demo.closing import as_json, closing_table
+from drivelink.demo.closing import as_json, closing
 from drivelink.demo.watching import DemoRun, rig_process
 from drivelink.errors import DrivelinkError
+from drivelink.output.document import show
 from drivelink.pubsub.client import subscribe
 
 CASES = ("constant", "quadratic", "vsa-ii", *closedloop.CASES)
@@ -38,7 +39,13 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `demo`."""
-    parser.add_argument("--case", choices=CASES, default="vsa-ii", help="which joint, and what happens to it")
+    parser.add_argument(
+        "--case",
+        choices=CASES,
+        default="vsa-ii",
+        metavar="CASE",
+        help=f"{', '.join(CASES)} (default: %(default)s)",
+    )
     add_number(
         parser,
         "--seconds",
@@ -69,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
             return 130
         raise DrivelinkError("the simulated drive and the daemon ended unexpectedly")
     if not args.json:
-        console.print(closing_table(args.case, shown.comparison, summary, shown.received, joint.bus.period_s))
+        show([closing(args.case, shown.comparison, summary, shown.received, joint.bus.period_s)], console)
     else:
         print(json.dumps(as_json(args.case, shown.comparison, summary, shown.received)))
     return 130 if interrupted else 0
@@ -99,7 +106,7 @@ def _closed_loop(args: argparse.Namespace, console: Console, *, live: bool) -> i
     if args.json:
         print(json.dumps(document))
     else:
-        console.print(*closedloop.closing(document), sep="\n")
+        show([closedloop.closing(document)], console)
     if interrupted:
         return 130
     return 0 if "fallen" in run.times else 1

@@ -26,10 +26,11 @@ _AT_REST_S = 0.3  # a person waits for each of these
 EPILOG = """\
 examples:
   drivelink doctor                     this machine: real time, memory, CAN, zenoh
-  drivelink doctor elbow.toml          also the bus, nodes, mappings, units; moves nothing. While the joint
-                                       moves under its controller: units and signs of positions and torque
+  drivelink doctor elbow.toml          also bus, nodes, mappings, units; moves nothing
   drivelink doctor elbow.toml --move   you move the joint, it says how, and ticks each sign and scale off
   drivelink doctor --eds drive.eds     before buying: what a drive can give
+
+Units and signs of positions and torque are checked while the joint moves under its controller.
 """
 
 

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from drivelink import jointfile
 from drivelink.cli import add_number, add_seconds
-from drivelink.errors import UsageError
+from drivelink.errors import UsageError, ZenohError
 from drivelink.loop.finding import folder_of
 from drivelink.monitor.statuslines import shape
 from drivelink.monitor.terminal import Keys, joints_table
@@ -23,10 +23,12 @@ from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import WebView, document
 from drivelink.monitor.webaccept import WebAcceptance
 from drivelink.monitor.webday import WebDay
+from drivelink.plaintext import stamped
 from drivelink.pubsub.clientbase import PATIENCE_S
 from drivelink.pubsub.session import ENDPOINT, close_session, open_client
 
 _POLL_S = 0.02
+_ABSENT_S = 10.0  # without a daemon, until plain lines end
 _FRAME_S = 0.1
 
 EPILOG = """\
@@ -36,6 +38,9 @@ examples:
   drivelink monitor --web              the same in a browser, with plots
   drivelink monitor elbow.toml --foxglove
   drivelink monitor elbow | tee log    without a terminal: a plain line a second
+
+Without a terminal a line that says nothing new is not repeated, and the command fails where no daemon is
+there for 10 s.
 """
 
 
@@ -102,10 +107,10 @@ def run(args: argparse.Namespace) -> int:
         stack.enter_context(suppress(KeyboardInterrupt))
         if args.web:
             _serve(watcher, args, end, acceptance)
-        elif sys.stdout.isatty() and not args.json:
-            _show(watcher, end, f"{prefix}/{name or '*'} at {config or endpoint}")
+        elif (console := Console()).is_terminal and not (args.json or console.options.ascii_only):
+            _show(watcher, console, end, f"{prefix}/{name or '*'} at {config or endpoint}")
         else:
-            _print(watcher, end, args.every, as_json=args.json)
+            _print(watcher, end, args, f"{config or endpoint}")
     return 0
 
 
@@ -148,9 +153,8 @@ def _is_file(name: str) -> bool:
     return name.endswith(".toml") or "/" in name
 
 
-def _show(watcher: Watcher, end: float, where: str) -> None:
+def _show(watcher: Watcher, console: Console, end: float, where: str) -> None:
     """The view in the terminal, until the end, `q` or Ctrl-C; `?` shows what the lines mean."""
-    console = Console()
     begin = time.monotonic()
     helping = False
     with Keys() as keys, Live(console=console, screen=True, auto_refresh=False, transient=True) as live:
@@ -188,20 +192,34 @@ def _picture(
     return Group(joints_table(views, console.size.width), Text(""), *alarms, footer)
 
 
-def _print(watcher: Watcher, end: float, every_s: float, *, as_json: bool) -> None:
-    """Print a line or JSON object per joint at each interval."""
-    due = time.monotonic() + every_s
-    while time.monotonic() < end:
+def _print(watcher: Watcher, end: float, args: argparse.Namespace, where: str) -> None:
+    """Print a line or JSON object per joint at each interval; a line only if it says something new.
+
+    Raises:
+        ZenohError: no daemon is there for a while.
+    """
+    there = time.monotonic()
+    due, said = there + args.every, {"": ""}
+    while (now := time.monotonic()) < end:
         watcher.poll()
-        if time.monotonic() >= due:
-            due += every_s
-            views = [view for _, view in sorted(watcher.views.items())]
-            if as_json:
-                lines = [json.dumps(document(view), allow_nan=False) for view in views]
-            else:
-                lines = [view.line() for view in views] or ["no joint yet"]
-            for line in lines:
-                print(line, flush=True)
+        if watcher.alive:
+            there = now
+        elif now - there > _ABSENT_S:
+            nobody = f"no joint at {where}: drivelink run JOINT starts a daemon"
+            hint = next((view.hint for view in watcher.views.values() if view.hint), nobody)
+            raise ZenohError(f"{hint} (waited {_ABSENT_S:g} s)")
+        if now >= due:
+            due += args.every
+            views = sorted(watcher.views.items())
+            for name, view in views:
+                if args.json:
+                    print(json.dumps(document(view), allow_nan=False), flush=True)
+                elif (line := view.line()) != said.get(name):
+                    print(stamped(line, sys.stdout), flush=True)
+                    said[name] = line
+            if not views and not args.json and "" in said:
+                print("no joint yet", flush=True)
+                said.clear()
         time.sleep(_POLL_S)
 
 

@@ -22,8 +22,7 @@ from drivelink.jointfile.schema import SimSection
 EPILOG = """\
 examples:
   drivelink sim elbow.toml                             on the bus of the joint file
-  drivelink sim elbow.toml --interface socketcand      serve a bus over TCP: no SocketCAN needed; the daemon
-                                                       in another terminal takes the same option
+  drivelink sim elbow.toml --interface socketcand      over TCP, without SocketCAN; `drivelink run` likewise
   drivelink sim elbow.toml --motion next.csv           play what `drivelink diagnose --motion` designed
   drivelink sim elbow.toml --channel vcan0 --effect coulomb_friction=0.3 --quirks epos4
 """

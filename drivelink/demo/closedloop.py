@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from drivelink.demo.rig import Change, Changed, RunSummary
@@ -22,6 +21,8 @@ from drivelink.jointfile import JointFile
 from drivelink.loop import finding
 from drivelink.loop.acceptance import Proposal, Trial, accept, proposal
 from drivelink.monitor.terminal import Keys
+from drivelink.output.document import Grid, Paragraph, Rows, Section
+from drivelink.output.numbers import number, value_and_interval
 from drivelink.pubsub.client import Subscription
 from estimator.sample import SIGMA_95, Status
 
@@ -211,26 +212,25 @@ def result(name: str, run: ClosedLoop, summary: RunSummary) -> dict[str, Any]:
     return document
 
 
-def closing(document: Mapping[str, Any]) -> list[Table | Text]:
+def closing(document: Mapping[str, Any]) -> Section:
     """Return the end of a run: truth beside what was found, errors, times."""
-    table = Table(title=f"{document['case']}: truth beside finding", title_justify="left")
-    for heading in ("", "truth", "found", "95 %"):
-        table.add_column(heading, justify="left" if not heading else "right", no_wrap=True)
+    rows: Rows = []
     for key, one in document["parameters"].items():
-        found = (
-            ["–", ""] if one["found"] is None else [f"{one['found']:.4g}", f"± {SIGMA_95 * one['std']:.2g}"]
-        )
-        table.add_row(key, f"{one['truth']:.4g}", *found)
-    lines: list[Table | Text] = [table]
+        found, half = ("–", "") if one["found"] is None else value_and_interval(
+            one["found"], SIGMA_95 * one["std"]
+        )  # fmt: skip
+        rows.append((key, number(one["truth"]), found, f"± {half}" if half else ""))
+    lines = []
     error = document["error"]
     if error is not None:
-        before, after = (f"{error[f'{when}_rms_nm']:.3g} N·m" for when in ("before", "after"))
+        before, after = (f"{number(error[f'{when}_rms_nm'], 3)} N·m" for when in ("before", "after"))
         relative = f"{error['before_relative']:.2%} before, {error['after_relative']:.2%} after"
-        lines.append(Text(f"error of the motor torque on held-out data: {relative} ({before}, {after})"))
+        lines.append(f"error of the motor torque on held-out data: {relative} ({before}, {after})")
     if document["residual_ratio"] is not None:
-        lines.append(Text(f"residual after the acceptance: {document['residual_ratio']:.2g} × its baseline"))
+        lines.append(f"residual after the acceptance: {number(document['residual_ratio'], 2)} × its baseline")
     times = {step: document[f"{step}_s"] for step in STEPS}
     steps = [f"{step} {time_s:.1f} s" for step, time_s in times.items() if time_s is not None]
-    lines.append(Text(f"after the change: {', '.join(steps) or 'nothing'}"))
-    lines.append(Text(f"{document['cycles']} cycles, {document['missed_cycles']} missed"))
-    return lines
+    lines.append(f"after the change: {', '.join(steps) or 'nothing'}")
+    lines.append(f"{document['cycles']} cycles, {document['missed_cycles']} missed")
+    grid = Grid(("", "truth", "found", "95 %"), rows)
+    return Section(f"{document['case']}: truth beside finding", [grid, *map(Paragraph, lines)])

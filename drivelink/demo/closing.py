@@ -5,12 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple, TypeVar
 
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
-
 from drivelink.demo.rig import RunSummary
 from drivelink.monitor.history import TruePoint
+from drivelink.output.document import Grid, Paragraph, Rows, Section
 from drivelink.output.numbers import number, value_and_interval
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import SIGMA_95, Status
@@ -91,47 +88,38 @@ def _keep(waiting: dict[int, T], sequence: int, item: T) -> None:
         del waiting[next(iter(waiting))]
 
 
-def closing_table(
+def closing(
     case: str, comparison: Comparison, summary: RunSummary, received: int, period_s: float
-) -> RenderableType:
+) -> Section:
     """Return the last pair of truth and estimate, the errors of the whole run, and the cycle's figures."""
     errors = comparison.errors()
-    table = Table(title=f"{case}: truth beside estimate", title_justify="left")
-    for heading in ("", "truth", "estimate", "95 %", "rms error"):
-        table.add_column(heading, justify="left" if not heading else "right", no_wrap=True)
+    rows: Rows = []
+    lines: list[str] = []
     if comparison.latest is not None:
         estimate, truth = comparison.latest
         value, half = value_and_interval(estimate.stiffness_nm_rad, SIGMA_95 * estimate.stiffness_std_nm_rad)
-        table.add_row(
-            "stiffness / N·m/rad",
-            number(truth.stiffness_nm_rad, 5),
-            value,
-            f"± {half}" if half else "",
-            _percent(errors.stiffness),
-        )
-        table.add_row(
-            "flexibility torque / N·m",
-            number(truth.flexibility_torque_nm),
-            number(estimate.flexibility_torque_nm),
-            "",
-            _percent(errors.flexibility_torque),
-        )
-    lines = [
+        torques = (number(one.flexibility_torque_nm) for one in (truth, estimate))
+        rows += [
+            ("stiffness / N·m/rad", number(truth.stiffness_nm_rad, 5), value, f"± {half}" if half else "",
+             _percent(errors.stiffness)),
+            ("flexibility torque / N·m", *torques, "", _percent(errors.flexibility_torque)),
+        ]  # fmt: skip
+        doubt = "" if estimate.status & Status.VALID else ", which is not valid"
+        lines.append(f"truth, estimate and its 95 % interval: of the last cycle{doubt}")
+    if errors.cycles:
+        over = f"rms error: over all {errors.cycles} valid cycles ({errors.cycles * period_s:.1f} s), "
+        lines.append(f"{over}relative to the truth's rms")
+    else:
+        lines.append("no valid cycle, so no error: an estimate is valid after some seconds of motion")
+    lines += [
         f"{summary.cycles} cycles, {summary.missed_cycles} missed, {received} estimates received over zenoh",
         f"a cycle's work p99 {summary.work_p99_us:.0f} µs, SYNC late by p99 {summary.lateness_p99_us:.0f} µs",
     ]
     if errors.cycles:
-        over = f"rms error: over all {errors.cycles} valid cycles ({errors.cycles * period_s:.1f} s), "
-        lines.insert(0, f"{over}relative to the truth's rms")
         held = f"the 95 % interval held the truth in {_percent(errors.covered)}"
         lines.append(f"{held} of {errors.cycles} valid cycles")
-    else:
-        lines.insert(0, "no valid cycle, so no error: an estimate is valid after some seconds of motion")
-    if comparison.latest is not None:
-        valid = comparison.latest[0].status & Status.VALID
-        doubt = "" if valid else ", which is not valid"
-        lines.insert(0, f"truth, estimate and its 95 % interval: of the last cycle{doubt}")
-    return Group(table, *map(Text, lines))
+    grid = Grid(("", "truth", "estimate", "95 %", "rms error"), rows)
+    return Section(f"{case}: truth beside estimate", [grid, *map(Paragraph, lines)])
 
 
 def as_json(case: str, comparison: Comparison, summary: RunSummary, received: int) -> dict[str, Any]:

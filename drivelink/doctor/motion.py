@@ -24,7 +24,9 @@ _WINDOW_S = 0.02  # differences over less are mostly quantisation
 _LEAST_COUNTS = 50  # minimum number for a decision
 _TOLERANCE = 0.15  # relative; velocities are filtered in the drive
 _LINK_TOLERANCE = 0.35  # the transmission bends
+_MOST_LOST = 0.05  # share of the samples, from which on a busy machine is the likeliest reason
 _STILL = "move the joint during the check, by its controller (--seconds 20 gives more time)"
+_LOST = "this machine is too busy to read every sample: end other programs, and run drivelink doctor again"
 _MOVING = "the joint moves: look longer (--seconds 20), or at a faster and wider motion"
 
 
@@ -46,6 +48,8 @@ def judge_record(section: Section, joint: JointFile, record: Record | None) -> N
 
 def _advice(record: Record) -> str:
     """What would decide what could not be decided."""
+    if len(record) < (1.0 - _MOST_LOST) * (record.sequence[-1] - record.sequence[0] + 1):
+        return _LOST
     for position in record.motor_position_rad.T:
         steps = np.abs(np.diff(position))
         count = np.min(steps[steps > 0.0], initial=np.inf)

@@ -9,8 +9,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
+from rich.text import Text
 
 from drivelink.notice import Findings, Severity
+from drivelink.plaintext import spelt
 
 _MARKS = {
     Severity.OK: ("✓", "green"),
@@ -64,7 +66,7 @@ class Report:
         for section in self.sections:
             if section.notices:
                 console.print(f"[bold]{escape(section.title)}[/bold]", highlight=False)
-                console.print(Padding(_table(section), (0, 0, 1, 1)))
+                console.print(Padding(_table(section, console.encoding), (0, 0, 1, 1)))
         console.print(self._closing(), highlight=False)
 
     def _closing(self) -> str:
@@ -81,15 +83,15 @@ class Report:
         return f"[green]{self.fine}[/green]"
 
 
-def _table(section: Section) -> Table:
+def _table(section: Section, encoding: str) -> Table:
     table = Table(box=None, show_header=False, padding=(0, 1), pad_edge=False)
     table.add_column(width=1)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for finding in section.notices:
         mark, colour = _MARKS[finding.severity]
-        text = escape(finding.text)
+        text = Text(spelt(finding.text, encoding))
         if finding.fix:
-            text += f"\n[dim]fix:[/dim] [{colour}]{escape(finding.fix)}[/{colour}]"
-        table.add_row(f"[{colour}]{mark}[/{colour}]", escape(finding.subject), text)
+            text.append("\nfix: ", "dim").append(spelt(finding.fix, encoding), colour)
+        table.add_row(Text(spelt(mark, encoding), colour), Text(finding.subject), text)
     return table

@@ -137,6 +137,8 @@ class JointView:
         estimate = self.history.latest
         if estimate is None:
             return f"{self.name}: {self.hint or 'no estimate yet'}"
+        if not self.live:
+            return f"{self.name}: {self.state.partition(',')[0]}"
         parts = [
             f"{self.name}:",
             f"stiffness {with_interval(estimate.stiffness_nm_rad, half_interval(estimate), 'N·m/rad')},",
@@ -148,7 +150,7 @@ class JointView:
         stiffness, _ = self.history.relative_errors()
         if math.isfinite(stiffness):
             parts[-1] += f", stiffness error {100 * stiffness:.2f} %"
-        if self.status and self.live:
+        if self.status:
             parts[-1] += f", {status_text(self.status, self.model, self.finding)}"
         return " ".join(parts)
 

@@ -15,6 +15,7 @@ from rich.text import Text
 
 from drivelink.output import plots
 from drivelink.output.numbers import Units
+from drivelink.plaintext import spelt
 from estimator.model import ParameterValue
 
 PARAMETER_HEAD = ("parameter", "value", "± (95 %)", "unit")
@@ -103,21 +104,24 @@ def show(sections: Iterable[Section], console: Console) -> None:
             if isinstance(block, Paragraph):
                 console.print(Text(block.text), soft_wrap=True)
             elif isinstance(block, Grid):
-                console.print(_printed(block, section.title))
+                console.print(_printed(block, section.title, console.encoding))
             elif isinstance(block, Lines):
                 for line in block.lines:
                     console.print(Text(f"  {line}"), soft_wrap=True)
 
 
-def _printed(grid: Grid, title: str) -> Table:
-    table = Table(title=grid.title or title, title_justify="left")
+def _printed(grid: Grid, title: str, encoding: str) -> Table:
+    table = Table(title=spelt(grid.title or title, encoding), title_justify="left")
     for k, column in enumerate(grid.head):
-        table.add_column(column, justify="left" if k == 0 or column == "unit" else "right")
+        left = k == 0 or column == "unit"
+        table.add_column(
+            spelt(column, encoding), justify="left" if left else "right", overflow="fold", no_wrap=k > 0
+        )
     for row in grid.rows:
         if len(row) == 1:
             table.add_section()
         style = "bold" if len(row) == 1 or _text(row[0]).startswith("▶") else ""
-        table.add_row(*(Text(_text(cell)) for cell in row), style=style)
+        table.add_row(*(Text(spelt(_text(cell), encoding)) for cell in row), style=style)
     return table
 
 

@@ -118,6 +118,6 @@ class Units:
             text, half_text = value_and_interval(x, half)
             plain = f"{x:.5g}"
             if not half_text and "e" not in plain:
-                text = plain
+                text = plain.replace("-", "−")
             found.append((text, half_text, f"{unit}{power}"))
         return found

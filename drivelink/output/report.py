@@ -168,7 +168,8 @@ def _errors(outcome: Diagnosis, units: Units) -> Grid:
         )  # fmt: skip
         part = one.after_rms_nm / max(one.before_rms_nm, 1e-300)
         rows.append((name, before, after, Share(f"{part:.0%}", part)))
-    after = "with the effects" if outcome.effects else "refitted"
+    named = any(finding.name != "unlisted" for finding in outcome.effects)
+    after = "with the effects" if named else "with a free curve" if free_curve(outcome) else "refitted"
     return Grid(("", "as declared", after, "after / before"), rows)
 
 
@@ -198,10 +199,11 @@ def _candidates(outcome: Diagnosis) -> list[Block]:
     shown = [r for k, r in enumerate(outcome.rivals) if k < _RIVALS or (r.name, r.motor) in chances]
     most = max(rival.error_relative for rival in shown)
     rows: Rows = []
+    several = len(outcome.transmissions) > 1
     for rival in shown:
         mine = chances.get((rival.name, rival.motor))
         p = others.get(rival.name) if mine is None else mine
-        motor = f" {rival.motor + 1}" if rival.motor else ""
+        motor = f", motor {rival.motor + 1}" if rival.motor is not None and several else ""
         named = f"{'' if mine is None else '▶ '}{in_words(rival.name)}{motor}"
         chance = "" if not chances else f"< {choice('even'):g}" if p is None else f"{p:.2f}"
         left = Share(f"{rival.error_relative:.2%}", rival.error_relative / most)
@@ -214,11 +216,11 @@ def _candidates(outcome: Diagnosis) -> list[Block]:
 
 def _choice_of(outcome: Diagnosis, chosen: list[float]) -> str:
     """Why the chosen candidates were chosen, where another one leaves less error alone."""
-    if not outcome.effects:
+    if not chosen:
         return "None was chosen: alone or together they predict other stretches no better."
     together = f" together; together they leave {outcome.train.after_relative:.2%}" if len(chosen) > 1 else ""
     text = f"▶ chosen{together}."
-    if chosen and outcome.rivals[0].error_relative < min(chosen):
+    if outcome.rivals[0].error_relative < min(chosen):
         text += (
             f" Though {in_words(outcome.rivals[0].name)} alone leaves less: an effect with more freedom fits "
             "any recording better. What counts is how likely an effect is to predict other stretches of the "

@@ -68,7 +68,10 @@ def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
     left = outcome.validation
     text = f"{left.after_relative:.2%} of the torque ({left.after_rms_nm:.3g} {unit} rms) stays unexplained"
     if outcome.verdict == "unexplained":
-        return f"{text} even with the free curve, which has no name in the library."
+        free = (
+            "a free curve, which has no name in the library" if free_curve(outcome) else "whatever was tried"
+        )
+        return f"{text} even with {free}."
     if outcome.verdict == "insufficient_excitation":
         return f"{text}; this motion does not reveal whether anything is missing."
     return f"{text}: noise, or effects too small to be separated from it in these data."

@@ -110,9 +110,9 @@ def test_files_links_and_programs_of_a_page_exist_and_its_code_parses(page):
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_that_a_page_shows_can_be_parsed(page):
     parser = cli.make_parser(list(cli.VERBS))
-    text = page.read_text(encoding="utf-8").replace(" \\\n", "")
+    text = re.sub(r" \\\n +", " ", page.read_text(encoding="utf-8"))
     for line in re.findall(r"^ {0,4}(?:sudo |\.venv/bin/)?drivelink ([a-z].*)$", text, re.MULTILINE):
-        command = shlex.split(re.split(r"\s{2,}|\s[#|&]|`", line)[0])
+        command = shlex.split(re.split(r"\s{2,}|\s[#|&>]|`", line)[0])
         if command[0] in cli.VERBS and not set(line) & set("…["):
             assert parser.parse_args(command).verb == command[0]
     verbs = subparsers()

@@ -13,7 +13,12 @@ from zenohkit import free_endpoint, make_estimate, make_joint, put_estimate, unt
 
 import drivelink
 from drivelink._core import encode_estimate
+from drivelink.doctor.machine import examine_zenoh
+from drivelink.doctor.report import Section
 from drivelink.errors import ZenohError
+from drivelink.jointfile import JointText
+from drivelink.notice import Severity
+from drivelink.pubsub.clientbase import joints
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
@@ -82,6 +87,18 @@ def test_a_controller_with_the_right_certificates_receives_everything(configure,
         assert until(lambda: joint.model)["joint"] == "elbow"
         publisher.close()
         until(lambda: joint.state == "gone")  # liveliness comes through, too
+
+
+def test_a_joint_file_names_the_configuration_of_its_subscribers(configure, serve):
+    daemon, controller = (configure(f"{name}-mtls.json5") for name in ("daemon", "controller"))
+    _, publisher = serve(daemon)
+    joint = make_joint("elbow", "tcp/127.0.0.1:1", f'config = "{daemon}"\nsubscriber_config = "{controller}"')
+    source = JointText(joint=joint, text="", folder=Path(), name="elbow.toml")
+    assert joints(config=source.zenoh_config) == ["elbow"]
+    section = Section("Zenoh")
+    assert examine_zenoh(section, joint, Path()) == ["elbow"]
+    assert {finding.severity for finding in section.notices} == {Severity.OK, Severity.INFO}
+    publisher.close()
 
 
 @pytest.mark.parametrize(

@@ -182,11 +182,12 @@ def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> list[st
         The joints that are served there.
     """
     settings = joint.zenoh
-    config = base_dir / settings.config if settings.config is not None else None
-    if config is not None and not config.is_file():
-        section.error("zenoh", f"{settings.config}: there is no such file", "correct zenoh.config")
-        return []
-    where = settings.config or settings.endpoint
+    for name in filter(None, (settings.config, settings.subscriber_config)):
+        if not (base_dir / name).is_file():
+            section.error("zenoh", f"{name}: there is no such file", "correct [zenoh] in the joint file")
+            return []
+    named = settings.subscriber_config or settings.config
+    config, where = base_dir / named if named else None, named or settings.endpoint
     if config is None and not answers(settings.endpoint):
         section.ok("zenoh", f"{where}: nobody there yet, the daemon will listen there")
         return []

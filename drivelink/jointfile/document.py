@@ -132,8 +132,8 @@ class JointText:
 
     @property
     def zenoh_config(self) -> Path | None:
-        """The zenoh configuration that it names."""
-        name = self.joint.zenoh.config
+        """The zenoh configuration of subscribers that it names."""
+        name = self.joint.zenoh.subscriber_config or self.joint.zenoh.config
         return self.folder / name if name else None
 
 

@@ -275,6 +275,9 @@ class ZenohSection(_Section):
     """Where the estimates go."""
 
     config: str | None = Field(None, description="zenoh configuration (JSON5), relative to the joint file")
+    subscriber_config: str | None = Field(
+        None, description="that of monitor, record, accept, doctor and the black box; left out: `config`"
+    )
     prefix: str = Field(
         "drivelink", pattern=r"^[^*$#?\s/]+(/[^*$#?\s/]+)*$", description="first part of every key"
     )

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import chain, islice
 from pathlib import Path
-from typing import TypeVar
 
-from drivelink._core import SYNC_COB_ID, JointPipeline, Tick
+from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.syncclock import measure_period
 from drivelink.errors import DriveError, RecordingError
@@ -53,9 +52,6 @@ def is_frame_log(path: Path, frames: bool | None = None) -> bool:
     return kinds == {"can"}
 
 
-_Fed = TypeVar("_Fed", Cycle, Tick)
-
-
 class FrameLog:
     """A raw CAN recording of a joint.
 
@@ -92,7 +88,6 @@ class FrameLog:
             self._assembly = Assembly(joint.timed(self.period_s), self._listener)
         except DriveError as error:
             raise RecordingError(f"{path}: {error}") from error
-        self.assembler = self._assembly.assembler
 
     def cycles(self) -> Iterator[Cycle]:
         """Yield the cycles of the frames; to be iterated once.
@@ -100,29 +95,17 @@ class FrameLog:
         Raises:
             RecordingError: the recording is damaged, or contains no sample.
         """
-        return self._fed(self._assembly.cycle)
-
-    def ticks(self, pipeline: JointPipeline) -> Iterator[Tick]:
-        """Yield the published output of the cycles; to be iterated once.
-
-        Raises:
-            RecordingError: as for `cycles`.
-        """
-        return self._fed(pipeline.feed)
-
-    def _fed(self, feed: Callable[[int, bytes, int, int], _Fed | None]) -> Iterator[_Fed]:
-        """Pass the frames through the assembler."""
         assembly, heard, samples = self._assembly, set(), False
         numbered = numbered_at_once if self._follow else numbered_ahead
         for (stamp_ns, can_id, data, _), jump in numbered(chain(self._head, self._frames), self.period_s):
-            fed = feed(can_id, data, jump, stamp_ns)
+            cycle = assembly.cycle(can_id, data, jump, stamp_ns)
             heard.add(can_id)
-            sample = None if fed is None else fed.sample
+            sample = None if cycle is None else cycle.sample
             samples |= sample is not None
             now_s = _seconds(stamp_ns, assembly.assembler.sequence, self.period_s)
             assembly.follow(can_id, data, sample, now_s)
-            if fed is not None:
-                yield fed
+            if cycle is not None:
+                yield cycle
         doubts = list(assembly.follower.doubts.values())
         if not samples:
             why = f": {doubts[0]}" if doubts else self._absent(heard)

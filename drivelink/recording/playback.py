@@ -39,15 +39,12 @@ class Playback:
         period_s: float,
         total: int | None,
         cycles: Callable[[JointPipeline], Iterator[Played]],
-        assembler: Assembler | None = None,
     ) -> None:
         self.motors = len(joint.motor)  # number of motors
         self.period_s = period_s  # of recording and estimator
         self.total = total  # number of cycles, if known
-        # Without an assembler its input are samples.
-        self.pipeline = JointPipeline(
-            assembler or Assembler((), 0), *build(joint.timed(period_s))
-        )  # their pipeline
+        # Samples are its input, by whatever they were made.
+        self.pipeline = JointPipeline(Assembler((), 0), *build(joint.timed(period_s)))
         self._cycles = cycles
 
     def __iter__(self) -> Iterator[Played]:
@@ -75,16 +72,14 @@ def open_playback(
     Raises:
         RecordingError: it cannot be read, or is incomplete.
     """
+    period_s, recorded, state = joint.bus.period_s, None, None
     if is_frame_log(path, frames):
         log = FrameLog(path, joint, base_dir, channel)
-        period_s = log.period_s
-        return Playback(
-            joint, period_s, None, lambda pipeline: _played(log.ticks(pipeline), period_s), log.assembler
-        )
-    if path.suffix.lower() == ".mcap":
-        period_s = joint.bus.period_s
+        period_s, recorded = log.period_s, log.cycles()
+    elif path.suffix.lower() == ".mcap":
         recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)
         state = read_attachment(path, SNAPSHOT)
+    if recorded is not None:
         return Playback(
             joint,
             period_s,

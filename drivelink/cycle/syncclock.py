@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,14 +66,14 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
     if spread > _JITTERY:
         # A step of nearly two periods may be jitter; only larger ones count as lost.
         lost = np.where(gaps > 2.2 * period_s, np.rint(gaps / period_s) - 1, 0)
-        slope, std = _slope(np.concatenate(([0.0], np.cumsum(1 + lost))), stamps)
+        slope, std = slope_of(stamps, np.concatenate(([0.0], np.cumsum(1 + lost))))
     else:
         slope, std = period_s, period_s
         for _ in range(2):  # renumber by the improved period
             clock = SyncClock(slope)
             jumps = np.array([clock.jump(stamp_ns) for stamp_ns in stamps_ns])
             if np.count_nonzero(jumps > 0) >= _FEWEST:
-                slope, std = _slope(np.cumsum(np.maximum(jumps, 0))[jumps > 0], stamps[jumps > 0])
+                slope, std = slope_of(stamps[jumps > 0], np.cumsum(np.maximum(jumps, 0))[jumps > 0])
     tolerance = _SIGMAS * std
     if abs(slope - expected_s) <= max(_SAME * expected_s, tolerance):
         return MeasuredPeriod(expected_s, True, spread <= _JITTERY)
@@ -87,8 +87,8 @@ def _agree(places: FloatArray) -> bool:
     return bool(np.abs(np.mean(np.exp(2j * np.pi * places))) ** 2 * places.size > -math.log(_CHANCE))
 
 
-def _slope(numbers: FloatArray, times_s: FloatArray) -> tuple[float, float]:
-    """Slope of a line through times over numbers, and its standard deviation."""
+def slope_of(times_s: FloatArray, numbers: NDArray[Any]) -> tuple[float, float]:
+    """Return the slope of a line through times over their numbers, and its standard deviation."""
     n, t = numbers - numbers.mean(), times_s - times_s.mean()
     slope = float(n @ t / (n @ n))
     return slope, float(np.sqrt(np.mean((t - slope * n) ** 2) / (n @ n)))

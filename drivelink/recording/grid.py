@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import minimum_filter1d
 
+from drivelink.cycle.syncclock import slope_of
 from drivelink.errors import RecordingError
 from estimator.sample import FloatArray
 
@@ -146,8 +147,7 @@ def _number_jittered(time: FloatArray, where: str) -> tuple[NDArray[np.int64], f
         behind = since / period - index
         least = minimum_filter1d(behind, _AHEAD, origin=-(_AHEAD // 2), mode="nearest")
         sequence = index + np.maximum.accumulate(np.rint(least - least[0]).astype(np.int64))
-        n = sequence - sequence.mean()
-        period = float(np.dot(n, since) / np.dot(n, n))
+        period, _ = slope_of(since, sequence)
     off = since - sequence * period
     off -= np.median(off)
     worst = float(np.abs(off).max()) / period
@@ -164,11 +164,7 @@ def _rounded(time: FloatArray, sequence: NDArray[np.int64], nominal_s: float | N
 
     A round value is used if it is within three standard deviations of the slope.
     """
-    n = sequence - sequence.mean()
-    power = float(np.dot(n, n))
-    centred = time - time.mean()
-    slope = float(np.dot(n, centred)) / power
-    spread = float(np.sqrt(np.mean((centred - slope * n) ** 2) / power))
+    slope, spread = slope_of(time, sequence)
     tolerance = min(3.0 * spread + 1e-6 * slope, 0.25 * slope / float(sequence[-1]))
     nice = [] if nominal_s is None else [nominal_s]
     nice += [float(f"{slope:.{digits}g}") for digits in (1, 2)]

@@ -1,4 +1,4 @@
-"""EMCY messages and statuswords in words (CiA 301, 7.2.7; CiA 402-2, 8.4)."""
+"""EMCY messages, NMT states and statuswords in words (CiA 301, 7.2.7, 7.2.8; CiA 402-2, 8.4)."""
 
 from __future__ import annotations
 
@@ -82,3 +82,11 @@ def drive_state(statusword: int) -> str:
     """Return the state in a statusword (CiA 402-2, table 30), whatever toggles or depends on modes."""
     masks = State402.SW_MASK.items()
     return next((name.lower() for name, (mask, value) in masks if statusword & mask == value), "unknown")
+
+
+NMT_STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
+
+
+def nmt_state(state: int) -> str:
+    """Return the state in a heartbeat."""
+    return NMT_STATES.get(state, f"0x{state:02X}")

@@ -14,6 +14,7 @@ import can
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.bus import FrameBus, frames, run_program, sender
+from drivelink.canopen.emcy import nmt_state
 from drivelink.canopen.guard import check_frame
 from drivelink.canopen.pdo import read_identity, read_optional
 from drivelink.canopen.sdo import Program, Read, SdoAbort
@@ -25,7 +26,6 @@ _ANSWER_S = 0.3  # for the slowest node
 _LONGEST_NAME = 80  # characters of a device's name that are shown
 _GAP_S = 0.001  # between two requests: 127 of them must not fill a transmit queue
 _PROFILES = {301: "CiA 301", 401: "CiA 401 (I/O)", 402: "CiA 402 (drive)", 406: "CiA 406 (encoder)"}
-_STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
 _MOST_STAMPS = 200_000
 
 
@@ -73,8 +73,7 @@ class Traffic:
         if cob_id == SYNC_COB_ID and len(self.sync_s) < _MOST_STAMPS:
             self.sync_s.append(message.timestamp)
         elif 0x701 <= cob_id <= 0x77F and len(data) == 1:
-            state = data[0] & 0x7F
-            self.heartbeats[cob_id - 0x700] = _STATES.get(state, f"0x{state:02X}")
+            self.heartbeats[cob_id - 0x700] = nmt_state(data[0] & 0x7F)
 
 
 def listen(bus: FrameBus, seconds: float, on_frame: Callable[[can.Message], None] | None = None) -> Traffic:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from drivelink._core import Assembler, NodeCounters
-from drivelink.canopen.emcy import drive_state
+from drivelink.canopen.emcy import drive_state, nmt_state
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.loop import LoopJoint
 from drivelink.cycle.objectcheck import contradicted
@@ -153,7 +153,6 @@ def residual_ratio(monitor: ResidualMonitor | None) -> float | None:
 
 _NS = 1_000_000_000
 _HEARTBEATS_LOST = 3.5  # of them missing: the node is gone
-STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
 OPERATIONAL = 0x05
 _STATE_BITS, _ENABLED, _LIMIT = 0x6F, 0x27, 0x0800  # of the statusword (CiA 402-2, 8.4.2)
 _COUNTED = (  # counter of a node; its smallest reported increase, and the message: its end is not worth one
@@ -201,18 +200,13 @@ class WatchedNode:
         """Of its joint."""
         return self.loop_joint.pipeline.assembler
 
-    @property
-    def state_text(self) -> str:
-        """Its NMT state in words."""
-        return STATES.get(self.state, f"0x{self.state:02X}")
-
     def status(self, now: int) -> dict[str, Any]:
         """Return its part of the status document, at a time in ns."""
         node, assembler = self.layout.node_id, self.assembler
         word, faults = assembler.statuswords.get(node), assembler.faults
         age_s = round((now - self.heartbeat_ns) / _NS, 3)
         return {
-            "state": self.state_text,
+            "state": nmt_state(self.state),
             "heartbeat_age_s": age_s if self.layout.heartbeat_ms else None,
             "drive_state": drive_state(word) if word is not None else None,
             "internal_limit": word is not None and bool(word & _LIMIT),

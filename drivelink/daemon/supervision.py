@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from drivelink.canopen.configure import Configurator
-from drivelink.canopen.emcy import parse_emergency
+from drivelink.canopen.emcy import NMT_STATES, nmt_state, parse_emergency
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.sdo_sniffer import is_mapping, written_object
@@ -21,7 +21,7 @@ from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.objectcheck import ObjectCheck, ReadBack
 from drivelink.cycle.sources import OVERFLOW, LostSource
 from drivelink.daemon.buswatch import BusWatch
-from drivelink.daemon.jointwatch import OPERATIONAL, STATES, JointWatch, WatchedNode, contradiction
+from drivelink.daemon.jointwatch import OPERATIONAL, JointWatch, WatchedNode, contradiction
 from drivelink.daemon.status import EventLog
 
 logger = logging.getLogger(__name__)
@@ -227,7 +227,7 @@ class Supervisor:
         self._events.begin(
             f"start {node}",
             f"node {node} is configured and was started, but sends none of its frames; "
-            f"it says {watched.state_text}{why}",
+            f"it says {nmt_state(watched.state)}{why}",
         )
 
     def _heartbeat(self, cob_id: int, data: bytes) -> None:
@@ -244,7 +244,7 @@ class Supervisor:
             if isinstance(self._follower, PassiveFollower):  # its heartbeat has its default again
                 watched.layout = replace(watched.layout, heartbeat_ms=0)
         self._overhear(cob_id, data)
-        if state in STATES:
+        if state in NMT_STATES:
             watched.state = state
 
     def _emergency(self, cob_id: int, data: bytes) -> None:

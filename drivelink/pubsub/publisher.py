@@ -24,12 +24,11 @@ import zenoh.ext
 from drivelink._core import Tick
 from drivelink.canopen.layout import NodeLayout, layout_document
 from drivelink.errors import ZenohError
-from drivelink.jointfile import JointFile, MotorSection
+from drivelink.jointfile import JointFile, MotorSection, effect_entry, plain_parameters
 from drivelink.pubsub.feed import DOCUMENTS
 from drivelink.pubsub.session import Stream, one_line
 from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, SAMPLE
 from drivelink.version import __version__
-from estimator.model import Effect
 from estimator.sample import Bits, ExternalStatus, Status
 from estimator.transmissions import RIGID
 
@@ -230,7 +229,7 @@ def describe_model(joint: JointFile, layouts: Sequence[NodeLayout] = ()) -> dict
         "motors": [_describe_motor(motor) for motor in joint.motor],
         "link": {
             "dynamics": asdict(joint.link.dynamics) if joint.link.dynamics else None,
-            "effects": _describe_effects(joint.link.effect),
+            "effects": [effect_entry(effect) for effect in joint.link.effect],
         },
         "provenance": joint.provenance,
         "nodes": [layout_document(layout) for layout in layouts],
@@ -244,14 +243,10 @@ def _describe_motor(motor: MotorSection) -> dict[str, Any]:
         "transmission": {
             "model": motor.transmission.model,
             "order": motor.transmission.order,
-            "parameters": dict(motor.transmission.parameters),
+            "parameters": plain_parameters(motor.transmission.parameters),
         },
-        "effects": _describe_effects(motor.effect),
+        "effects": [effect_entry(effect) for effect in motor.effect],
     }
-
-
-def _describe_effects(effects: tuple[Effect, ...]) -> list[dict[str, Any]]:
-    return [{"name": effect.name, "parameters": dict(effect.parameters)} for effect in effects]
 
 
 def schema() -> dict[str, Any]:

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from daemonkit import served, vsa
 from zenohkit import LIMIT_S, make_joint, ready, script, until
 
+from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.errors import ZenohError
 from drivelink.jointfile import ZenohSection
 from drivelink.pubsub.publisher import JointPublisher
@@ -184,6 +186,18 @@ def test_where_a_router_was_no_daemon_takes_its_place(endpoint, router):
         until(lambda: not daemon.info.routers_zid())
         with router():  # fails if the endpoint is taken
             until(lambda: daemon.info.routers_zid())
+
+
+def test_a_daemon_says_that_its_router_is_lost_and_back(endpoint, router):
+    joint = vsa(endpoint=endpoint)
+    with ExitStack() as stack:
+        stack.enter_context(served(joint))
+        with router():
+            daemon = stack.enter_context(Daemon([ServedJoint(joint=joint)], real_time=False))
+        until(lambda: "zenoh router is lost" in daemon.events.active.get("router", ""))
+        with router():
+            until(lambda: not daemon.events.active)
+    assert [event["text"] for event in daemon.events.recent()][-1] == "the zenoh router is back"
 
 
 def test_connections_that_say_nothing_lock_no_subscriber_out(endpoint):

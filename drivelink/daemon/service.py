@@ -36,7 +36,7 @@ from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
 from drivelink.loop.feed import FindingFeed, SnapshotFeed
 from drivelink.pubsub.publisher import JointPublisher
-from drivelink.pubsub.session import close_session, open_session
+from drivelink.pubsub.session import close_session, open_session, watch_router
 from drivelink.systemd.unit import Watchdog, notify, watchdog_period_s
 
 logger = logging.getLogger("drivelink")
@@ -227,12 +227,17 @@ class Daemon:
             first = self._joints[0]
             session = open_session(first.joint.zenoh, first.folder)
             self._closing.callback(close_session, session)
+            self._closing.callback(watch_router(session, self._tell_router).undeclare)
         publishers: list[JointPublisher | None] = []
         for served in self._joints:
             publisher = JointPublisher(session, served.joint, express=served is self._joints[-1])
             self._closing.callback(publisher.close)
             publishers.append(publisher)
         return publishers
+
+    def _tell_router(self, lost: bool) -> None:
+        text = "the connection to the zenoh router is lost: who is behind it receives nothing"
+        self.events.keep("router", lost, text, "the zenoh router is back")
 
     def _make_loop(self) -> CycleLoop:
         section = self._section

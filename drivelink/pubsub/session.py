@@ -19,6 +19,7 @@ import resource
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -239,6 +240,22 @@ def _join(endpoint: str) -> zenoh.Session:
             f"end it, or set zenoh.endpoint in the joint file"
         )
     return session
+
+
+def watch_router(session: zenoh.Session, tell: Callable[[bool], object]) -> Any:
+    """Have `tell` called in zenoh's thread when the connection to a router is lost (True), or there (False).
+
+    Returns:
+        The listener, to be undeclared.
+    """
+
+    def changed(event: zenoh.TransportEvent) -> None:
+        if event.transport.whatami == zenoh.WhatAmI.ROUTER:
+            tell(event.kind == zenoh.SampleKind.DELETE)
+
+    # indirect=False: in zenoh's thread, which never keeps the process from ending
+    handler = zenoh.handlers.Callback(changed, indirect=False)
+    return session.info.declare_transport_events_listener(handler)
 
 
 def close_session(session: zenoh.Session) -> None:

@@ -306,15 +306,21 @@ def test_an_mcap_file_unpacks_to_so_many_records_and_bytes(record, said, tmp_pat
         list(read_messages(path))
 
 
+BLF_HEAD = struct.pack("<4sL136x", b"LOGG", 144)
+
+
+def blf_frame(can_id=0x80):
+    return struct.pack("<4sHHLLLHHQHBBL8x", b"LOBJ", 32, 1, 48, 1, 2, 0, 0, 0, 1, 0, 0, can_id)
+
+
+def blf_container(packed, frames_):
+    one = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32 + len(packed), 10, 2, 48 * frames_) + packed
+    return one + bytes(len(one) % 4)
+
+
 def blf_of(path, frames_, containers):
     """A BLF file of containers with so many frames each."""
-    frame = struct.pack("<4sHHLLLHHQ", b"LOBJ", 32, 1, 48, 1, 2, 0, 0, 0) + struct.pack(
-        "<HBBL8x", 1, 0, 0, 0x80
-    )
-    packed = zlib.compress(frame * frames_, 9)
-    one = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32 + len(packed), 10, 2, 48 * frames_) + packed
-    one += bytes(len(one) % 4)
-    path.write_bytes(struct.pack("<4sL136x", b"LOGG", 144) + one * containers)
+    path.write_bytes(BLF_HEAD + blf_container(zlib.compress(blf_frame() * frames_, 9), frames_) * containers)
     return list(read_frames(path))
 
 
@@ -323,6 +329,26 @@ def test_a_blf_file_unpacks_to_so_many_frames_and_bytes(tmp_path):
     for count, containers, said in ((100, 1000, "one record for each"), (200_000, 1, "32 times")):
         with one_line(said):
             blf_of(tmp_path / "r.blf", count, containers)
+
+
+@pytest.mark.parametrize(
+    ("can_id", "read_of_it", "said"),
+    [
+        (0x8000_0080, 20_000, "no CAN frame with an 11-bit identifier"),
+        (0x181, 100_000, "expected SYNC frames"),
+    ],
+)
+def test_a_log_that_is_none_of_canopen_is_not_read_to_its_end(
+    can_id, read_of_it, said, tmp_path, monkeypatch
+):
+    packed = zlib.compress(blf_frame(can_id) * 5000, 0)
+    (tmp_path / "r.blf").write_bytes(BLF_HEAD + blf_container(packed, 5000) * 30)
+    kind, passed = CAN_FORMATS[".blf"], []
+    counting = kind._replace(reader=lambda file: (passed.append(1) or m for m in can.BLFReader(file)))
+    monkeypatch.setitem(CAN_FORMATS, ".blf", counting)
+    with one_line(said):
+        read(tmp_path / "r.blf", JOINT)
+    assert read_of_it <= len(passed) < read_of_it + 5000
 
 
 @pytest.mark.parametrize(

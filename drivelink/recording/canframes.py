@@ -29,6 +29,7 @@ _LOG = logging.getLogger("drivelink.recording")
 
 _QUIET_SYNCS = 500  # without a change, the configuration has ended
 _MOST_HELD = 1 << 18  # frames among them: more than a bus of 127 nodes sends
+_WITHOUT_SYNC = 100_000  # frames at the beginning: half a minute of a bus whose master does not run yet
 _PEEK = 20_000  # messages that show whether an MCAP file has samples
 
 
@@ -136,8 +137,10 @@ class FrameLog:
         listener, head = self._listener, self._head
         syncs: deque[int] = deque(maxlen=2 * _QUIET_SYNCS)
         quiet, heard = 0, False
-        for frame in self._frames:
+        for number, frame in enumerate(self._frames):
             stamp_ns, can_id, data, _ = frame
+            if not syncs and number > _WITHOUT_SYNC:
+                break
             if not listener.busy:
                 head.append(frame)
                 if len(head) > _MOST_HELD:

@@ -64,6 +64,7 @@ _LAST_ID = 0x7FF
 _LONGEST = 64  # bytes of a frame, excluding CAN XL
 _LINE = 16 << 10  # bytes; candump's longest, of CAN XL, has 6 KiB
 _HOPELESS = 20  # unknown lines at the beginning after which it is not a log
+_FOREIGN = 20_000  # messages at the beginning without a frame of CANopen, likewise
 _DISORDER_NS = 1_000_000_000  # largest disorder of stamps within a file
 _GAP_NS = 1_000_000_000
 _LOOK_AHEAD = 2000  # frames examined for the meaning of stamps, and for channels
@@ -280,7 +281,7 @@ def _added_up(frames: Iterable[LoggedFrame]) -> Iterator[LoggedFrame]:
 def _library_frames(path: Path) -> Iterator[LoggedFrame]:
     """Read by python-can's reader; a truncated file ends at its last complete frame."""
     kind = CAN_FORMATS[path.suffix.lower()]
-    count = 0
+    count = foreign = 0
     try:
         # Opened here, because a reader leaves a malformed file open.
         with open_regular(path) as file:
@@ -289,9 +290,11 @@ def _library_frames(path: Path) -> Iterator[LoggedFrame]:
                 most -= 1
                 if most < 0:
                     raise too_many_records(path)
-                if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
-                    continue
-                if message.arbitration_id > _LAST_ID or len(message.data) > _LONGEST:
+                special = message.is_extended_id or message.is_error_frame or message.is_remote_frame
+                if special or message.arbitration_id > _LAST_ID or len(message.data) > _LONGEST:
+                    foreign += 1
+                    if not count and foreign > _FOREIGN:
+                        return
                     continue
                 count += 1
                 stamp_ns = round(message.timestamp * 1e9)

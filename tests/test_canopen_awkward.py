@@ -116,14 +116,6 @@ def test_a_pdo_that_cannot_be_changed_at_all_is_taken_as_it_is_unless_it_is_off(
         configured(Frozen(5, objects))
 
 
-def test_what_is_never_sent_on_sync_is_asked_for_once_a_period():
-    slave = Slave(5, drive_objects(5), refuse={(0x1800, 2): 0x06090030})
-    _, layout = configured(slave, bus="period_s = 0.004")
-    assert layout.tpdos[0].transmission_type == 255
-    assert slave.objects[0x1800, 5].value == 4
-    assert any("may be older than their SYNC" in finding.text for finding in layout.notices)
-
-
 def test_odd_answers_and_counted_empty_places_are_understood():
     objects = drive_objects(5) | tpdo(1, NO_RTR | 0x185, 255, *[0] * 8)
     del objects[0x60A9, 0], objects[0x607E, 0]

@@ -60,19 +60,6 @@ def test_one_frame_carries_position_torque_and_statusword_and_a_second_one_what_
     assert signals(layout) == [plain, [Signal.LINK_POSITION, Signal.MOTOR_VELOCITY]]
 
 
-CURRENT_SOURCE = 'torque_source = "current"\ncurrent_object = "0x30D1:02"\ntorque_constant_nm_a = 0.1'
-
-
-def test_a_32_bit_current_moves_the_statusword_to_the_next_frame():
-    slave = drive()
-    slave.objects[0x30D1, 2] = u32(0, mappable=True)
-    _, layout = configured(slave, drive=CURRENT_SOURCE)
-    # TPDO1 has the statusword already, and is taken as it is
-    assert sorted(signals(layout), key=len) == [
-        [Signal.STATUSWORD], [Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE],
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize("keep_bit_30", [False, True])
 @pytest.mark.parametrize("cob", [NO_RTR | 0x185, 0x185])
 def test_a_second_start_writes_nothing_and_bit_30_stays_as_the_drive_has_it(keep_bit_30, cob):
@@ -219,15 +206,6 @@ def test_a_drive_that_makes_sync_itself_is_stopped_or_named():
         configured(constant)
 
 
-def test_a_foreign_sync_is_refused_before_anything_is_sent():
-    wire = Wire([drive()])
-    for _ in range(5):
-        wire.put(0x80, b"")
-    with pytest.raises(BusError, match=r'another master already produces SYNC.*bus\.sync = "follow"'):
-        configure(wire, parse(joint_text()))
-    assert wire.sent == []
-
-
 def several(*nodes):
     """(drives, the joints of one drive each)."""
     text = joint_text()
@@ -252,32 +230,6 @@ def test_unneeded_frames_are_switched_off_where_the_load_demands_it():
     assert all(slave.objects[0x1801, 1].value & INVALID for slave in slaves)
     # SYNC 55 + 4 frames of 135 bits at 1 kHz, four heartbeats of 65 bits at 10 Hz
     assert configurator.load().bits_per_s == pytest.approx(1000 * (55 + 4 * 135) + 4 * 10 * 65)
-
-
-def ended(configurator, wire):
-    """What a configuration beside the loop ends in: one step at a time, nothing blocks."""
-    now = 0.0
-    while not (results := configurator.poll(now)):
-        now += 0.001
-        if message := wire.recv():
-            configurator.feed(message.arbitration_id, bytes(message.data), now)
-    return results
-
-
-def test_a_node_that_rebooted_is_configured_again_beside_the_loop_and_one_that_stays_away_can_be_tried_again():
-    slave = drive()
-    wire = Wire([slave])
-    configurator, ((before,),) = configure_joints(wire, [parse(joint_text())])
-    slave.silent = True
-    configurator.start(5)
-    ((node, error),) = ended(configurator, wire)
-    assert node == 5 and isinstance(error, DriveError)
-    slave.objects, slave.state, slave.silent = drive_objects(5), 0x7F, False  # as after power-on
-    configurator.start(5)
-    assert configurator.busy
-    assert [(node, result.tpdos) for node, result in ended(configurator, wire)] == [(5, before.tpdos)]
-    assert slave.state == 5
-    assert not configurator.busy
 
 
 class Failing(Wire):

@@ -1,5 +1,5 @@
 import pytest
-from canopenkit import Slave, Wire, configure, drive_objects, eds_text, joint_text, signals
+from canopenkit import eds_text, joint_text, signals
 
 from drivelink._core import Assembler
 from drivelink.canopen.layout import Signal
@@ -27,12 +27,6 @@ def passive(text_drive, base=None):
     return configurator.layouts[5]
 
 
-def test_the_joint_files_mapping_is_taken():
-    layout = passive(STATED + MAP + "transmission_type = 255\n")
-    assert (layout.tpdos[0].cob_id, layout.tpdos[0].transmission_type) == (0x2A5, 255)
-    assert signals(layout) == [[Signal.STATUSWORD, Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE]]
-
-
 @pytest.mark.parametrize(
     ("drive", "said"),
     [
@@ -50,45 +44,6 @@ EDS = eds_text(
     "VendorNumber=0x1F", x1800sub1=(7, "$NODEID+0x180"), x1800sub2=(5, 1), x1A00sub0=(5, 2),
     x1A00sub1=(7, "0x60640020"), x1A00sub2=(7, "0x60770010"), x608Fsub1=(7, 16384), x608Fsub2=(7, 1), x6076=(7, 800),
 )  # fmt: skip
-
-
-def test_a_data_sheet_gives_mapping_identifier_and_scale(tmp_path):
-    (tmp_path / "drive.eds").write_text(EDS)
-    layout = passive('eds = "drive.eds"\ngear_ratio = 50.0', base=tmp_path)
-    assert layout.tpdos[0].cob_id == 0x185
-    assert layout.tpdos[0].objects[1].scale == pytest.approx(0.0008 * 50)
-    assert layout.identity[0] == 0x1F
-
-
-def exchanged(active, joint):
-    """A foreign master's configuration, as a passive listener on the same bus sees it."""
-    wire = Wire([active])
-    configure(wire, joint)
-    frames = []
-    for line in wire.log:
-        _, cob_id, data = line.split(" ", 2)
-        frames.append((int(cob_id, 16), bytes.fromhex(data)))
-    return frames
-
-
-def test_a_foreign_masters_configuration_is_learnt_by_listening_and_followed_when_it_changes():
-    slave = Slave(5, drive_objects(5))
-    configurator = PassiveConfigurator([parse(joint_text(bus=PASSIVE))])
-    assert configurator.busy
-    for cob_id, data in exchanged(slave, parse(joint_text())):
-        configurator.feed(cob_id, data, 0.0)
-    ((node, layout),) = configurator.poll(0.0)
-    assert node == 5 and not configurator.busy
-    # nothing is stated in this joint file: mapping, scale, heartbeat and identity are all in the traffic
-    (known,) = configure(Wire([Slave(5, drive_objects(5))]), parse(joint_text()))
-    assert (layout.tpdos, layout.heartbeat_ms, layout.identity) == (known.tpdos, 100, known.identity)
-    wider, ended = parse(joint_text(link="[link.encoder]\ncounts_per_rev = 1000")), []
-    for cob_id, data in exchanged(slave, wider):
-        configurator.feed(cob_id, data, 0.0)
-        ended += configurator.poll(0.0)
-    assert configurator.layouts[5].tpdos  # never lost meanwhile
-    assert all(not isinstance(result, DriveError) for _, result in ended)
-    assert any(frame.cob_id == 0x285 for frame in configurator.layouts[5].other_tpdos)
 
 
 TIMEOUT_S = 0.5

@@ -5,7 +5,7 @@ from canopenkit import Item, Slave, Wire, drive_objects
 from drivelink.canopen.bus import run_program
 from drivelink.canopen.guard import ForbiddenFrameError, SilentBus, check_frame
 from drivelink.canopen.pdo import read_optional
-from drivelink.canopen.sdo import Nmt, Pause, Read, SdoTimeout, Session, Write, abort_text, read_number
+from drivelink.canopen.sdo import Read, SdoTimeout, Session, Write, abort_text, read_number
 from drivelink.errors import BusError, DriveError
 
 
@@ -72,22 +72,6 @@ def test_late_answers_and_other_nodes_are_not_taken_for_ours():
     assert not running.done
     running.feed(0x585, bytes.fromhex("43 64 60 00 07 00 00 00"), 0.0)
     assert running.result == b"\x07\0\0\0"
-
-
-def test_a_program_can_pause_and_command_nodes_without_anybody_waiting():
-    def program():
-        yield Nmt(5, 0x80)
-        yield Pause(0.02)
-        return (yield Read(5, 0x1000))
-
-    sent = []
-    running = session(program(), sent)
-    running.poll(1.0)
-    assert sent == [(0, "80 05")]
-    running.poll(1.01)
-    assert len(sent) == 1
-    running.poll(1.03)
-    assert sent[1][0] == 0x605
 
 
 def segment(*, toggle=0, length=7, last=False):

@@ -98,16 +98,6 @@ def test_each_estimate_answers_for_itself_and_what_its_status_speaks_against_is_
     assert joint.stale and not joint.valid  # by its own word
 
 
-def test_the_contact_loop_of_the_documentation_survives_a_gap(publisher, joint):
-    """`while joint.wait(timeout_s)` would end at the first pause."""
-    loop = joint.cycles(timeout_s=0.01)
-    publish(publisher, 1)
-    until(lambda: next(loop) is not None)
-    assert next(loop) is None
-    publish(publisher, 2)
-    until(lambda: (estimate := next(loop)) is not None and estimate.sequence == 2)
-
-
 def test_a_rigid_joint_says_that_its_stiffness_is_not_given(endpoint):
     """Valid for its torque: without the bit a client refuses NaN that is called valid."""
     text = f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.125\n[motor.transmission]\nmodel = "none"\n[zenoh]\nendpoint = "{endpoint}"'
@@ -144,16 +134,6 @@ def test_the_external_torque_comes_with_the_estimate_of_its_cycles_and_of_no_oth
         "a successor"  # which has said nothing yet: what its predecessor said is not its word
     )
     assert joint.external is None and joint.model is None
-
-
-def test_waiting_gives_the_next_cycle_once(publisher, joint):
-    publish(publisher, 5)
-    assert joint.wait(LIMIT_S).sequence == 5
-    assert joint.wait(0.01) is None  # the same cycle does not come twice
-    timer = threading.Timer(0.05, publish, (publisher, 6))
-    timer.start()
-    assert joint.wait(LIMIT_S).sequence == 6
-    timer.join()
 
 
 def test_iteration_ends_when_the_subscription_is_closed_meanwhile(publisher, joint):

@@ -23,10 +23,8 @@ from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
 from drivelink.monitor.statuslines import shape, status_lines
 from drivelink.monitor.terminal import joints_table
 from drivelink.monitor.view import JointView, flags
-from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import snapshot
 from drivelink.output.numbers import number, with_interval
-from drivelink.pubsub.session import close_session, open_client
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Status, TransmissionEstimate
 
@@ -196,23 +194,6 @@ def test_sparkline_and_plot_take_anything_and_are_never_wider_than_their_room():
 # Between processes
 
 
-def test_the_watcher_finds_joints_and_notes_when_they_are_gone():
-    endpoint = zenohkit.free_endpoint()
-    session = open_client(endpoint)
-    watcher = Watcher(session)
-
-    def polled():
-        watcher.poll()
-        return watcher.views.get("elbow")
-
-    with zenohkit.script("elbow", endpoint) as process:
-        zenohkit.ready(process)
-        zenohkit.until(lambda: (view := polled()) and view.history.latest and view.status and not view.gone)
-    zenohkit.until(lambda: (view := polled()) and view.gone)
-    watcher.close()
-    close_session(session)
-
-
 def printed(wanted, *arguments):
     """The first line that `drivelink monitor` prints of which this is true."""
     command = [sys.executable, "-m", "drivelink", "monitor", "--every", "0.2", *arguments]
@@ -350,12 +331,3 @@ def test_several_joints_are_one_line_each_and_no_column_is_cut_off():
         shown = lines(joints_table({"elbow": filled(), "wrist": gone, "far": far}, width), width)
         assert len(shown) == 4 and "daemon gone" in "".join(shown)
         assert all(len(line) <= width and "…" not in line for line in shown), shown
-
-
-def test_the_legend_explains_every_line_and_fits():
-    view = filled()
-    view.help = True
-    shown = lines(view, 120, 40)
-    for part in ("stiffness", "95 %", "dotted", "residual", "baseline", "observable", "? back"):
-        assert any(part in line for line in shown), part
-    assert len(lines(view, 80, 24)) <= 24

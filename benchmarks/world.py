@@ -16,10 +16,11 @@ T = 1e-3
 
 
 class World(NamedTuple):
-    """A recording of `world.c`, and the truth at each of its rows."""
+    """A recording of `world.c`, the truth at each of its rows, and all of its columns."""
 
     record: Record
     stiffness_nm_rad: np.ndarray
+    columns: dict[str, np.ndarray]
 
 
 @functools.cache
@@ -28,7 +29,9 @@ def program() -> tuple[Path, tempfile.TemporaryDirectory]:
     folder = tempfile.TemporaryDirectory(prefix="world")
     path = Path(folder.name) / "world"
     source = Path(__file__).with_name("world.c")
-    subprocess.run(["cc", "-O2", "-std=c11", "-o", path, source, "-lm"], check=True)
+    subprocess.run(
+        ["cc", "-O2", "-std=c11", "-Wall", "-Wextra", "-Werror", "-o", path, source, "-lm"], check=True
+    )
     return path, folder
 
 
@@ -49,4 +52,4 @@ def simulate(played: str | None = None, **settings: float | str) -> World:
         motor_torque_nm=column["motor1_torque_nm"][:, None],
         link_position_rad=column["link_position_rad"],
     )
-    return World(record, column["true_stiffness_nm_rad"])
+    return World(record, column["true_stiffness_nm_rad"], column)

@@ -47,7 +47,7 @@ PROTECTIONS = [
         ("flat messages", "recording/mcapfile.py", 'if b"[" in data or', "if False and", f"{LIMITS} -k messages_of_others"),
         ("objects of an EDS file", "canopen/eds.py", "if len(found) > _MOST_OBJECTS:", "if False:", "tests/test_canopen_eds.py -k bounded"),
         ("digits of an EDS file", "canopen/eds.py", "or len(text) > _MOST_DIGITS:", "or False:", "tests/test_canopen_eds.py -k bounded"),
-        ("stamps", "recording/limits.py", "if stamp_ns > _LAST_STAMP_NS:", "if False:", f"{LIMITS} tests/test_fuzz_parsers.py -k 'stamps or .log'"),
+        ("stamps", "recording/limits.py", "if stamp_ns > _LAST_STAMP_NS:", "if False:", f"{LIMITS} tests/test_fuzz_bus.py -k 'stamps or .log'"),
         ("number of samples", "recording/limits.py", "if count > MAX_SAMPLES:", "if False:", f"{LIMITS} -k 'gap_of_a_million'"),
         ("size of a BLF container", "recording/limits.py", "if unpacker.unconsumed_tail:", "if False:", f"{LIMITS} -k blf"),
         ("carried joint files open nothing", "recording/mapping.py", "joint=contained(jointfile.parse(text, name))", "joint=jointfile.parse(text, name)", f"{LIMITS} -k opens_nothing"),

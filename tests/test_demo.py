@@ -8,21 +8,16 @@ import os
 import signal
 import subprocess
 import sys
-from importlib import resources
 
 import pytest
 from rich.console import Console
 from zenohkit import LIMIT_S, until
 
-from drivelink import cli, jointfile
-from drivelink._core import Tick
-from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink import cli
 from drivelink.demo.closedloop import STEPS
 from drivelink.demo.closing import Comparison, as_json
 from drivelink.demo.closing import closing as closing_section
 from drivelink.demo.rig import RunSummary
-from drivelink.demo.simbus import open_sim_bus
-from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.demo.watching import DemoRun
 from drivelink.monitor.history import TruePoint
 from drivelink.output.document import show
@@ -35,32 +30,6 @@ DEMO = [sys.executable, "-m", "drivelink", "demo"]
 def message(sequence: int, torque: float, stiffness: float, *, status: int = Status.VALID) -> EstimateMessage:
     each = TransmissionEstimate(torque, stiffness, 1.0, 0.1)
     return EstimateMessage(sequence, 0, int(status), torque, stiffness, 1.0, (each,))
-
-
-class Statuses:
-    """A sink that keeps each status."""
-
-    def __init__(self) -> None:
-        self.seen: list[int] = []
-
-    def put(self, tick: Tick) -> None:
-        self.seen.append(tick.estimate.status)
-
-
-@pytest.mark.parametrize(
-    "case", [*(pytest.param(case, marks=pytest.mark.slow) for case in ("constant", "quadratic")), "vsa-ii"]
-)
-def test_in_a_healthy_demo_nothing_changes(case):
-    with resources.as_file(resources.files("drivelink") / "joints" / f"{case}.toml") as path:
-        joint = jointfile.load(path)
-    world, bus = world_from_joint(joint), open_sim_bus(joint.bus)
-    network, served = network_from_joint(joint, bus, world=world), [ServedJoint(joint=joint)]
-    with bus, Daemon(served, publish=False, devices=network.poll, real_time=False) as daemon:
-        (loop_joint,) = daemon.loop.loop_joints
-        loop_joint.sink = sink = Statuses()
-        daemon.run_lockstep(round(10.0 / joint.bus.period_s))
-    assert not any(status & Status.CHANGED for status in sink.seen)
-    assert sink.seen[-1] & Status.VALID
 
 
 def test_truth_and_estimate_are_paired_and_the_end_says_over_what_the_errors_are():

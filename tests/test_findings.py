@@ -18,8 +18,10 @@ from estimator.diagnosis.curves import _bases
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Problem
 from estimator.diagnosis.judge import Judge, _Judged
+from estimator.diagnosis.openorder import raised
 from estimator.diagnosis.search import Search
 from estimator.identify import identify
+from estimator.model import JointModel, Motor, Transmission
 from estimator.sample import Record
 
 
@@ -165,3 +167,32 @@ def test_of_the_motors_dry_friction_there_is_one_law():
     coulomb = next(one for one in search.screen(search.null, dry[0]) if one.candidate.rubs)
     beside = search.screen(search.problem.added(search.null, coulomb), dry[0])
     assert not any(term.candidate.rubs for term in beside)
+
+
+def joint(transmission: Transmission) -> JointModel:
+    return JointModel(arrangement="single", motors=(Motor(inertia_kg_m2=0.1, transmission=transmission),))
+
+
+def stiffening(power: float) -> Finding:
+    values = {"coefficient": 400.0, "power": power}
+    return Finding(name="higher_order_stiffness", location="transmission", motor=0, parameters=values, std={})
+
+
+@pytest.mark.parametrize(("power", "order"), [(3.0, 2), (5.0, 3)])
+def test_an_open_order_follows_the_power_that_was_found(power, order):
+    model = raised(joint(Transmission(model="polynomial")), [stiffening(power)])
+    assert model is not None
+    assert model.motors[0].transmission.order == order
+
+
+@pytest.mark.parametrize(
+    ("transmission", "found"),
+    [
+        (Transmission(model="polynomial", order=1), [stiffening(3.0)]),
+        (Transmission(model="polynomial", parameters={"coefficients_nm_rad": (150.0,)}), [stiffening(3.0)]),
+        (Transmission(model="vsa-ii"), [stiffening(3.0)]),
+        (Transmission(model="polynomial"), []),  # nothing to raise it for
+    ],
+)
+def test_what_the_joint_file_says_is_left_and_the_effect_stays_an_effect(transmission, found):
+    assert raised(joint(transmission), found) is None

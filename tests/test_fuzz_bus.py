@@ -1,9 +1,11 @@
-"""Frames of nonsense among the real ones: never an exception, never an estimate VALID and wrong."""
+"""Nonsense among real frames and damaged inputs of every parser: a result or one line, never VALID and wrong."""
 
 import logging
 import math
+import random
 
 import pytest
+from fuzzparsers import CORPUS, PARSERS, damaged, seeds, take
 from fuzzrun import FuzzRun
 
 from estimator.sample import Status
@@ -68,3 +70,16 @@ def test_after_all_that_a_calm_bus_gives_valid_estimates_again():
     assert run.judge.valid - before == 1000
     assert dict(run.configurator.layouts) == layouts
     assert run.supervisor.node_status(run.loop.loop_joints[0])["2"]["state"] == "operational"
+
+
+@pytest.mark.parametrize("times", [25, pytest.param(400, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
+@pytest.mark.parametrize("parser", PARSERS)
+def test_damaged_inputs_are_read_or_refused_in_one_line(parser, times, tmp_path, caplog):
+    caplog.set_level(logging.CRITICAL)
+    for path in sorted((CORPUS / parser).glob("*")):
+        take(parser, path.read_bytes(), tmp_path)
+    for good in seeds(parser):
+        take(parser, good, tmp_path)
+    rng = random.Random(times)
+    for _ in range(times):
+        take(parser, damaged(rng.choice(seeds(parser)), rng), tmp_path)

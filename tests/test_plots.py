@@ -1,10 +1,15 @@
-"""Plots: one style, legible without colour, the same file for the same data."""
+"""Plots: one style, legible without colour, the same file for the same data; and progress on a terminal."""
+
+import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from drivelink.output import plots
+from drivelink.output import plots, progress
 from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
+from drivelink.output.progress import Meter
 
 
 def wave(n=20_000):
@@ -82,3 +87,59 @@ def test_the_same_data_are_the_same_file(suffix, tmp_path):
         over_time(axes, {"φ": PlotCurve(t, phi)}, "φ / rad")
         contents.append(save(figure, tmp_path / f"{name}{suffix}").read_bytes())
     assert contents[0] == contents[1]
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that pass when asked to."""
+    made = SimpleNamespace(now_s=100.0, monotonic=lambda: made.now_s)
+    monkeypatch.setattr(progress, "time", made)
+    return made
+
+
+def console(terminal):
+    return Console(file=io.StringIO(), force_terminal=terminal, width=80)
+
+
+def text(shown):
+    return shown.file.getvalue()
+
+
+def test_quick_work_shows_nothing(clock):
+    for terminal in (True, False):
+        shown = console(terminal)
+        with Meter("count", 1000, shown) as meter:
+            for k in range(1000):
+                meter.update(k)
+        assert text(shown) == ""
+
+
+def test_long_work_without_a_terminal_is_a_line_now_and_then(clock):
+    shown = console(terminal=False)
+    with Meter("fit", 100, shown) as meter:
+        for k in range(100):
+            clock.now_s += 0.3
+            meter.update(k)
+    lines = text(shown).splitlines()
+    assert lines[0] == "fit: 16 % after 5 s" and 5 <= len(lines) <= 6
+
+
+def test_progress_says_what_is_being_done(clock):
+    for terminal in (True, False):
+        shown = console(terminal)
+        with Meter("diagnose run.csv", None, shown) as meter:
+            for stage in ("bandwidth", "search"):
+                clock.now_s += 6.0
+                meter.stage(stage)
+        assert "diagnose run.csv (bandwidth)" in text(shown) and "(search)" in text(shown)
+
+
+def test_long_work_on_a_terminal_is_a_bar_that_goes_away_also_where_it_breaks_off(clock):
+    shown = console(terminal=True)
+    with pytest.raises(KeyboardInterrupt), Meter("fit", 100, shown) as meter:
+        clock.now_s += 3.0
+        meter.advance(40)
+        raise KeyboardInterrupt
+    assert "fit" in text(shown) and "40/100" in text(shown)
+    assert text(shown).rstrip().endswith("\x1b[2K")  # the line is erased
+    assert "\x1b[?25h" in text(shown)  # the cursor is back

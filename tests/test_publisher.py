@@ -1,6 +1,5 @@
 """The keys of one joint: latched documents, queries, bytes and quality of service, and no influence from others."""
 
-import itertools
 import json
 import math
 import signal
@@ -166,22 +165,3 @@ def test_a_subscriber_that_stopped_does_not_stop_the_publisher(publisher, endpoi
         for _ in range(60_000):  # 300 bytes each: 18 MB
             put_estimate(publisher, estimate, 0)
         process.send_signal(signal.SIGCONT)
-
-
-def test_a_subscriber_that_dies_does_not_disturb_the_others(publisher, client, endpoint):
-    subscriber = client.declare_subscriber("drivelink/elbow/estimate", RING(4096))
-    with script(endpoint, name="zenoh_reader.py") as process:
-        ready(process)
-        until(lambda: put_estimate(publisher, make_estimate(0), 0) or subscriber.try_recv())
-        process.kill()
-        process.wait()
-    sequence, later = itertools.count(1), set()
-
-    def hundred():
-        """A hundred estimates after the death have come, whichever a busy machine has dropped."""
-        put_estimate(publisher, make_estimate(next(sequence)), 0)
-        while (sample := subscriber.try_recv()) is not None:
-            later.add(sample.payload.to_bytes())
-        return len(later) > 100
-
-    until(hundred)

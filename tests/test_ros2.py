@@ -149,15 +149,6 @@ def test_stiffness_is_a_labelled_matrix(transmissions):
     assert message.data.tolist() == numbers
 
 
-def test_a_cycle_arrives_where_a_ros_node_listens(ros2):
-    publisher, client = ros2()
-    message = receive(client, STATE, putting(publisher))
-    assert (message.name, stamp_in(message)) == (["elbow"], STAMP_NS)
-    assert (message.position[0], message.velocity[0], message.effort[0]) == (0.25, 0.5, -1.0)
-    message = receive(client, ARRAY, putting(publisher))
-    assert message.data.reshape(3, 2).tolist() == [[61.0, 1.75], [30.0, 1.0], [31.0, 1.5]]
-
-
 # The bits of an estimate, whether its stiffness is called valid, and what the example node makes of it.
 @pytest.mark.parametrize(
     ("status", "valid", "state"),

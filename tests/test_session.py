@@ -11,12 +11,11 @@ from pathlib import Path
 import pytest
 import zenoh
 from daemonkit import served, vsa
-from zenohkit import LIMIT_S, make_joint, ready, script, until
+from zenohkit import LIMIT_S, ready, script, until
 
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.errors import ZenohError
 from drivelink.jointfile import ZenohSection
-from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import FILES, close_session, daemon_config, open_client, open_session
 
 
@@ -166,16 +165,6 @@ def test_a_configuration_that_cannot_be_used_is_one_line_with_its_file(tmp_path,
     assert str(tmp_path / "mine.json5") in str(error.value)
     assert "\n" not in str(error.value)
     assert ".rs:" not in str(error.value)
-
-
-def test_two_joints_of_one_process_share_a_session(endpoint):
-    elbow, knee = make_joint("elbow", endpoint), make_joint("knee", endpoint)
-    with closing(open_session(elbow.zenoh, Path())) as session:
-        publishers = [JointPublisher(session, joint) for joint in (elbow, knee)]
-        with pytest.raises(ZenohError, match="joint named knee"):
-            JointPublisher(session, knee)
-        for publisher in publishers:
-            publisher.close()
 
 
 def test_where_a_router_was_no_daemon_takes_its_place(endpoint, router):

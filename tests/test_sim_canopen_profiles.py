@@ -1,13 +1,16 @@
-"""Each maker's habits, as a master meets them on the wire."""
+"""The simulated devices byte for byte on the wire, and each maker's habits, as a master meets them."""
 
 from contextlib import contextmanager
 
 import pytest
-from simkit import StubRig, wired
+from simkit import TRANSCRIPTS, StubRig, play, wired
 
-from sim.canopen.drive import Cia402Drive
+from sim.canopen.drive import Cia402Drive, StateMachine
+from sim.canopen.drive import PowerState as P
+from sim.canopen.encoder import Cia406Encoder
 from sim.canopen.profiles import PROFILES, profile
 from sim.errors import SimError
+from sim.sensors import LinkEncoder
 
 NO_OBJECT, NO_SUBINDEX, READ_ONLY = 0x06020000, 0x06090011, 0x06010002
 
@@ -159,3 +162,51 @@ def test_a_slow_device_boots_in_its_own_time():
 def test_an_unknown_profile_is_one_line_with_the_known_ones():
     with pytest.raises(SimError, match=rf"expected one of {', '.join(PROFILES)}, got \"acme\""):
         profile("acme")
+
+
+def device(name, rig):
+    if name == "encoder":
+        rig.encoder = LinkEncoder(counts_per_rev=65536)
+        return Cia406Encoder(1, rig, range_counts=65536 * 4096)
+    return Cia402Drive(1, rig, 0, link_encoder=True)
+
+
+@pytest.mark.parametrize("transcript", sorted(path.stem for path in TRANSCRIPTS.glob("*.txt")))
+def test_the_device_answers_as_written(transcript):
+    rig = StubRig()
+    with wired(device(transcript, rig), rig=rig) as wire:
+        assert play(wire, TRANSCRIPTS / f"{transcript}.txt") > 3
+
+
+WORDS = (0x06, 0x07, 0x0F, 0x00, 0x02)  # shutdown, switch on, enable operation, disable voltage, quick stop
+STATES = {
+    "D": P.SWITCH_ON_DISABLED, "R": P.READY_TO_SWITCH_ON, "S": P.SWITCHED_ON, "O": P.OPERATION_ENABLED,
+    "Q": P.QUICK_STOP_ACTIVE,
+}  # fmt: skip
+
+TABLE = {  # where each of WORDS leads from a state
+    (STATES[state], word): STATES[following]
+    for state, row in {"D": "RDDDD", "R": "RSODD", "S": "RSODD", "O": "RSODQ", "Q": "QQODQ"}.items()
+    for word, following in zip(WORDS, row, strict=True)
+}
+
+
+def machine(state):
+    made = StateMachine()
+    made.state = state
+    return made
+
+
+@pytest.mark.parametrize(("state", "word"), TABLE)
+def test_a_controlword_leads_where_the_standard_says(state, word):
+    made = machine(state)
+    made.control(word)
+    assert made.state is TABLE[state, word]
+
+
+def test_quick_stop_ends_disabled_or_stays_as_its_option_says():
+    for option in range(9):
+        made = machine(P.QUICK_STOP_ACTIVE)
+        made.quick_stop_option = option
+        made.step()
+        assert made.state is (P.QUICK_STOP_ACTIVE if option >= 5 else P.SWITCH_ON_DISABLED), option

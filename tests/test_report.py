@@ -1,5 +1,6 @@
 """`drivelink diagnose`: report.json as promised, a page of its own, a joint file that knows the effect."""
 
+import io
 import json
 import re
 from functools import cache
@@ -9,10 +10,12 @@ import fleetkit
 import joints
 import numpy as np
 import pytest
+from rich.console import Console
 
 from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.jointfile.apply_diagnosis import floor_entry, make_model_monitor
+from drivelink.output.document import Grid, Section, show
 from drivelink.output.numbers import Units
 from estimator.sample import Record
 
@@ -128,6 +131,20 @@ def test_every_coefficient_of_a_polynomial_has_its_unit():
     text = Units(linear=False).value("coefficients_nm_rad", tuple(float(k) for k in range(1, 9)), None)
     units = ["rad", "rad³", "rad⁵", "rad⁷", "rad⁹", "rad¹¹", "rad¹³", "rad¹⁵"]
     assert text == ", ".join(f"{k} N·m/{unit}" for k, unit in enumerate(units, start=1))
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80])
+def test_a_printed_table_keeps_every_letter_in_a_narrow_terminal(columns):
+    names = ("viscous_damping_nm_s_rad", "coefficients_nm_rad[2]")
+    grid = Grid(
+        ("where they differ most", "at", "of A", "of B"),
+        [(name, "−0.0147 rad/s", "140.00 N·m/rad", "–") for name in names],
+    )
+    console = Console(width=columns, file=io.StringIO(), record=True)
+    show([Section("", [grid])], console)
+    lines = console.export_text().splitlines()
+    first = "".join(line[1:].split("│")[0].strip() for line in lines if line.startswith("│"))
+    assert first == "".join(names) and max(map(len, lines)) <= columns
 
 
 def test_a_baseline_that_cannot_be_measured_is_a_warning(caplog):

@@ -53,16 +53,17 @@ def page(scenario, *views):
 
 
 def test_the_page_shows_numbers_flags_gauge_and_nodes_and_that_the_monitor_has_ended():
-    texts, ended = page(
+    texts, ended, band = page(
         """
         const look = names => names.map(shown);
         take(sent[0]);
         const texts = look(['stiffness', 'band', 'state', 'flags', 'gauges', 'nodes']);
         events.onerror();
-        return [texts, look(['state', 'flags', 'link'])];
+        return [texts, look(['state', 'flags', 'link']), measured(2.2e-4, 2.2e-4)];
         """,
         fed(),
     )
+    assert band == "0.00022"  # the digits of the value that it belongs to
     assert texts[:4] == ["100.0", "± 2.0", "running · rate 1000 Hz", "valid observable"]
     assert "0.50 × baseline" in texts[4] and "node 1 operational" in texts[5]
     state, flags, link = ended

@@ -142,7 +142,7 @@ class Comparison:
         rows: Rows = []
         for one in self.differences():
             unit = self.units.shown("N·m/rad" if one.kind == "stiffness" else "N·m")
-            apart = f"{abs(one.b - one.a) / one.std:.1f} σ" if one.std > 0.0 else "–"
+            apart = f"{number(abs(one.b - one.a) / one.std, 2)} σ" if one.std > 0.0 else "–"
             at = f"{number(one.at, 3)} {self.units.shown('rad' if one.kind == 'stiffness' else 'rad/s')}"
             a, b = (value_and_interval(value, SIGMA_95 * one.std)[0] for value in (one.a, one.b))
             rows.append((f"{one.kind}, motor {one.motor}", at, f"{a} {unit}", f"{b} {unit}", apart))
@@ -154,7 +154,7 @@ class Comparison:
             rows.append((f"{side.name}, windows of {a.horizon_s:.3g} s",))
             for name in a.channels:
                 fits = (one[name] for one in (a.fit_percent, b.fit_percent, a.coasting_percent))
-                rows.append((name, *(f"{fit:.2f} %" for fit in fits)))
+                rows.append((_in_words(name), *(f"{number(fit)} %" for fit in fits)))
         return Grid(("channel", "fit of A", "fit of B", "at constant velocity"), rows)
 
     def _over(self, side: Side, runs: Sequence[FreeRun]) -> Figure:
@@ -163,13 +163,13 @@ class Comparison:
         curves = {"measured": plots.PlotCurve(run.time_s[:n], run.measured_rad[:n, j])}
         for letter, one in zip("AB", runs, strict=True):
             curves[letter] = plots.PlotCurve(one.time_s[:n], one.simulated_rad[:n, j])
-        figure, (axes,) = plots.new_figure(width=2 * _WIDTH)
-        label = self.units.label(f"{run.channels[j].replace('_', ' ')} / rad")
+        figure, (axes,) = plots.new_figure(width=_WIDTH)
+        label = self.units.label(f"{_in_words(run.channels[j])} / rad")
         plots.over_time(axes, curves, label, side.name)
         return figure
 
     def _correlated(self, side: Side, runs: Sequence[FreeRun]) -> Figure:
-        figure, all_axes = plots.new_figure(columns=2, width=2 * _WIDTH)
+        figure, all_axes = plots.new_figure(rows=2, width=_WIDTH, height=2.0)
         both = [self.residuals(side, run) for run in runs]
         for axes, title, ones in zip(
             all_axes, ("with itself", "with the motor torque"), zip(*both, strict=True), strict=True
@@ -206,6 +206,10 @@ def beside(name: str, before: JointModel, after: JointModel, record: Record, uni
     about = Paragraph("A: the model as declared. B: with what was found.")
     curves, *rest = made.sections()
     return [Section("Model beside machine", [about, *curves.blocks]), *rest]
+
+
+def _in_words(channel: str) -> str:
+    return channel.replace("motor", "motor ").replace("_", " ")
 
 
 def _ranges(records: Sequence[Record], motor: int) -> tuple[float, float]:

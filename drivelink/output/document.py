@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import textwrap
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from string import Template
@@ -18,6 +19,7 @@ from drivelink.output.numbers import Units
 from drivelink.plaintext import spelt
 from estimator.model import ParameterValue
 
+_NARROWEST = 12  # columns of the names beside cells that are not folded
 PARAMETER_HEAD = ("parameter", "value", "± (95 %)", "unit")
 
 
@@ -104,18 +106,28 @@ def show(sections: Iterable[Section], console: Console) -> None:
             if isinstance(block, Paragraph):
                 console.print(Text(block.text), soft_wrap=True)
             elif isinstance(block, Grid):
-                console.print(_printed(block, section.title, console.encoding))
+                console.print(_printed(block, section.title, console))
             elif isinstance(block, Lines):
                 for line in block.lines:
                     console.print(Text(f"  {line}"), soft_wrap=True)
 
 
-def _printed(grid: Grid, title: str, encoding: str) -> Table:
+def _printed(grid: Grid, title: str, console: Console) -> Table:
+    encoding = console.encoding
+    body = [[_text(row[k]) for row in grid.rows if len(row) > 1] for k in range(len(grid.head))]
+    widths = [max(map(len, cells), default=0) for cells in body]
+    crowded = sum(max(pair) + 3 for pair in zip(widths, map(len, grid.head), strict=True)) >= console.width
     table = Table(title=spelt(grid.title or title, encoding), title_justify="left")
+    room = sum(widths[1:]) + 3 * len(widths) + _NARROWEST <= console.width
     for k, column in enumerate(grid.head):
         left = k == 0 or column == "unit"
+        if crowded and column:  # headings fold first
+            column = textwrap.fill(column, max(widths[k], *map(len, column.split())))
         table.add_column(
-            spelt(column, encoding), justify="left" if left else "right", overflow="fold", no_wrap=k > 0
+            spelt(column, encoding),
+            justify="left" if left else "right",
+            overflow="fold",
+            no_wrap=k > 0 and room,
         )
     for row in grid.rows:
         if len(row) == 1:

@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 from drivelink.files import write_whole
 from drivelink.output import plots
 from drivelink.output.document import Chart, Grid, Paragraph, Rows, Section
-from drivelink.output.numbers import Units, in_words
+from drivelink.output.numbers import Units, in_words, number
 from estimator.diagnosis.motion import NextMotion
 from estimator.sample import FloatArray
 
 _COLUMNS = ("position_rad", "velocity_rad_s", "acceleration_rad_s2", "torque_nm")
 _MOST = 1e6  # odds beyond are written as more than that
-_WIDTH = 9.2  # inches: of a page
+_WIDTH, _ON_PAGE = 9.2, 4.6  # inches: of the picture, and of one that a phone's page shows
 
 
 def write(motion: NextMotion, path: Path, units: Units, *, force: bool = False) -> list[Path]:
@@ -66,7 +66,7 @@ def section(motion: NextMotion, units: Units) -> Section:
         motion.rivals, motion.now, np.diag(motion.told), _least(motion), strict=True
     ):
         odds = float(np.exp(np.clip(least, 0.0, np.log(_MOST))))
-        against = f"{'> ' if odds >= _MOST else ''}{odds:.3g} : 1"
+        against = f"{'> ' if odds > 0.99 * _MOST else ''}{number(odds, 2)} : 1"
         rows.append((in_words(name), f"{now:.2f}", f"{told:.2f}", against))
     head = (
         "if this is what is missing",
@@ -75,14 +75,15 @@ def section(motion: NextMotion, units: Units) -> Section:
         "odds over the next best",
     )
     chart = Chart(
-        lambda: figure(motion, units), "Motion of the motors, and the torque that the likeliest needs."
+        lambda: figure(motion, units, _ON_PAGE),
+        "Motion of the motors, and the torque that the likeliest needs.",
     )
     return Section("What to move next", [Paragraph(said), Grid(head, rows), chart])
 
 
-def figure(motion: NextMotion, units: Units) -> Figure:
-    """Draw position, velocity and torque over time."""
-    drawn, axes = plots.new_figure(rows=3, width=_WIDTH, height=1.7)
+def figure(motion: NextMotion, units: Units, width: float = _WIDTH) -> Figure:
+    """Draw position, velocity and torque over time; inches."""
+    drawn, axes = plots.new_figure(rows=3, width=width, height=1.7)
     labels = ("position / rad", "velocity / (rad/s)", "torque / N·m")
     for one, name, label in zip(axes, (*_COLUMNS[:2], _COLUMNS[3]), labels, strict=True):
         values = getattr(motion, name)

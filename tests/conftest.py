@@ -6,12 +6,12 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
 
-import hypothesis  # noqa: E402
-import pytest  # noqa: E402
-import zenohkit  # noqa: E402
+import hypothesis
+import pytest
+import zenohkit
 
-from drivelink.pubsub.publisher import JointPublisher  # noqa: E402
-from drivelink.pubsub.session import close_session, open_session  # noqa: E402
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.session import close_session, open_session
 
 # A shell starts what runs in the background with SIGINT ignored, and processes hand that on to the ones they
 # start; the tests press Ctrl-C on theirs.

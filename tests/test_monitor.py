@@ -87,6 +87,8 @@ def test_a_view_without_anything_yet_says_so():
     view = JointView("elbow")
     assert "waiting for the first estimate" in "\n".join(lines(view))
     assert view.line() == "elbow: no estimate yet"
+    view.update(Estimate(1, 0, *[math.nan] * 3, (TransmissionEstimate(*[math.nan] * 4),)), 1.0)
+    assert "no values yet" in "\n".join(lines(view)) and "nan" not in view.line()
     view = filled()
     view.status = {"state": "running"}  # no baseline: not a word of what is observable beside a green one
     text = "\n".join(lines(view, 120, 40))

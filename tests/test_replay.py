@@ -233,7 +233,10 @@ def asked_over_zenoh(joint, layouts, endpoint, folder):
 
 
 def test_a_recording_begun_beside_a_running_daemon_replays_by_what_the_daemon_says(tmp_path, capsys):
-    """The daemon configured the drives before the recording began: it is asked for the mapping, over zenoh."""
+    """The daemon configured the drives before the recording began: it is asked for the mapping, over zenoh.
+
+    What it configures anew later, when all have rebooted, is followed: nothing before that is left out.
+    """
     endpoint = zenohkit.free_endpoint()
     text = daemonkit.vsa_text(endpoint=endpoint)
     joint = parse(text)
@@ -248,12 +251,15 @@ def test_a_recording_begun_beside_a_running_daemon_replays_by_what_the_daemon_sa
             pass
         skipped, cycle = len(rig.collector.samples), 0
         rig.run(100)
+        for node in (1, 2, 3):
+            rig.faults.reboot(rig.node(node))
+        rig.run(100)
         while (message := tap.recv(0)) is not None:
             cycle += message.arbitration_id == 0x080
             for sink in sinks:
                 sink.frame(BEGIN_NS + cycle * 1_000_000, message.arbitration_id, bytes(message.data))
         live = [repr(sample[1:]) for sample, _ in rig.collector.samples[skipped:]]
-    assert len(live) == 100
+    assert 150 < len(live) < 200
     for path, sink in zip(paths, sinks, strict=True):
         sink.close()
         played = [one.tick.sample for one in open_playback(path, joint, tmp_path, frames=True)]
@@ -261,7 +267,7 @@ def test_a_recording_begun_beside_a_running_daemon_replays_by_what_the_daemon_sa
         # The joint file is kept as well: nothing else is needed to replay it.
         assert cli.main(["replay", str(path), "--json"]) == 0
         document = json.loads(capsys.readouterr().out)
-        assert (document["joint"], document["cycles"]) == ("elbow", 100)
+        assert document["joint"] == "elbow" and 198 < document["cycles"] <= 200
 
 
 def test_what_a_daemon_said_counts_more_than_a_file_beside_the_recording(tmp_path):

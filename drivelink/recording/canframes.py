@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
 
 from drivelink._core import SYNC_COB_ID
+from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.syncclock import measure_period
 from drivelink.errors import DriveError, RecordingError
@@ -77,9 +78,12 @@ class FrameLog:
         self._passive = not joint.bus.configure
         self._listener = PassiveConfigurator([joint], [base_dir])
         self._head: list[LoggedFrame] = []  # after the configuration, read already
-        syncs, heard = self._learn_configuration()
+        syncs, heard, before = self._learn_configuration()
         declared = not self._listener.busy
-        if not heard and (known := recorded_layouts(path, joint.name, daemon=declared)):
+        known: Sequence[NodeLayout] = ()
+        if before or not heard:
+            known = recorded_layouts(path, joint.name, daemon=declared, begun=heard)
+        if known:
             self._listener = PassiveConfigurator([joint], [base_dir])
             self._listener.adopt(known)  # the nodes were configured before the recording began
             self._head, self._frames = [], frames()
@@ -126,17 +130,18 @@ class FrameLog:
             return ""
         return f": expected frames {', '.join(absent)}, got none (another node id, channel or mapping?)"
 
-    def _learn_configuration(self) -> tuple[list[int], bool]:
+    def _learn_configuration(self) -> tuple[list[int], bool, bool]:
         """Read the SDO transfers until the mapping is known and unchanged for a while.
 
         With another master it is enough that it is known: later changes are followed.
 
         Returns:
-            Stamps of the SYNCs until then, and whether the traffic contained a node's mapping.
+            Stamps of the SYNCs until then, whether the traffic contained a node's mapping, and whether there
+            were SYNCs before: then it is that of a node that has restarted.
         """
         listener, head = self._listener, self._head
         syncs: deque[int] = deque(maxlen=2 * _QUIET_SYNCS)
-        quiet, heard = 0, False
+        quiet, heard, before = 0, False, False
         for number, frame in enumerate(self._frames):
             stamp_ns, can_id, data, _ = frame
             if not syncs and number > _WITHOUT_SYNC:
@@ -155,8 +160,8 @@ class FrameLog:
                 listener.feed(can_id, data, now_s)
                 if listener.poll(now_s):
                     head.clear()
-                    quiet, heard = 0, True
-        return list(syncs), heard and not listener.busy
+                    quiet, heard, before = 0, True, before or (not heard and bool(syncs))
+        return list(syncs), heard and not listener.busy, before
 
     def _check_complete(self) -> None:
         """Raise if the mapping of a node is unknown."""

@@ -67,11 +67,12 @@ def layouts_from(data: bytes, joint: str, *, daemon: bool = False) -> list[NodeL
         raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
-def recorded_layouts(path: Path, joint: str, *, daemon: bool) -> Sequence[NodeLayout]:
+def recorded_layouts(path: Path, joint: str, *, daemon: bool, begun: bool = False) -> Sequence[NodeLayout]:
     """Return the first layouts of a joint's nodes in a recording, or ().
 
     Args:
         daemon: only from a daemon, whose layouts are those on the bus.
+        begun: only those with which the recording began, not those of a daemon that started later.
 
     Raises:
         RecordingError: the mapping is damaged.
@@ -80,7 +81,7 @@ def recorded_layouts(path: Path, joint: str, *, daemon: bool) -> Sequence[NodeLa
         if path.suffix.lower() != ".mcap":
             side = _read_side(path)
             return layouts_from(side, joint, daemon=daemon) if side else ()
-        for message in read_messages(path, frozenset({"mapping", "model"})):
+        for message in read_messages(path, frozenset({"mapping"} if begun else {"mapping", "model"})):
             if layouts := layouts_from(message.data, joint, daemon=daemon):
                 return layouts
     except ValueError as error:

@@ -53,7 +53,7 @@ def records() -> dict[str, Record]:
     return dict(zip(effects, kit.World(list(effects.values())).run(), strict=True))
 
 
-SLOW_CASES = ("cogging", "gauge", "offset", "constant", "inertia", "zero", "link")
+SLOW_CASES = ("coulomb", "cogging", "gauge", "offset", "constant", "inertia", "zero", "link")
 
 
 @pytest.mark.parametrize(
@@ -143,6 +143,7 @@ def test_a_ripple_of_less_than_two_periods_is_told_from_the_gears_which_reacts()
     assert effect.name == "cogging" and "kinematic_error" not in effect.alternatives
 
 
+@pytest.mark.slow
 def test_without_link_dynamics_friction_is_still_found(records):
     found = diagnose(records["coulomb"], kit.model(linked=False))
     # Offset and asymmetry are one thing without the link's side: a half quantum of the encoders is enough.

@@ -148,7 +148,7 @@ def test_it_is_valid_where_the_estimate_is_and_its_standard_deviation_is_that_of
     assert np.sqrt(np.mean(off**2)) > 0.1
 
 
-@pytest.mark.parametrize("error", [0.02, -0.05, 0.10])
+@pytest.mark.parametrize("error", [pytest.param(0.02, marks=pytest.mark.slow), -0.05, 0.10])
 def test_a_link_that_is_off_by_what_is_declared_raises_no_contact(free, error):
     link = replace(
         LINK,
@@ -252,7 +252,7 @@ def test_nothing_is_said_where_nothing_is_declared_and_a_rigid_transmission_reve
         assert rigid.external.status == 0 and math.isnan(rigid.external.external_torque_nm)
 
 
-@pytest.mark.parametrize("signal", ["motor", "link"])
+@pytest.mark.parametrize("signal", [pytest.param("motor", marks=pytest.mark.slow), "link"])
 def test_it_returns_when_positions_count_from_elsewhere_and_gravity_is_found_again(signal):
     joint = jointfile.load(Path(__file__).parents[1] / "examples" / "vsa-ii.toml")
     estimator = make_estimator(joint.model(), joint.estimator, 1e-3)

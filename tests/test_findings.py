@@ -105,6 +105,7 @@ def test_no_stiffness_is_fitted_where_the_balance_leaves_more_than_the_spring_ca
     assert fit(record, kit.model(linked=False))[0].parameters
 
 
+@pytest.mark.slow
 def test_a_second_healthy_recording_has_no_finding():
     first, second = (kit.World([{}], seed=seed).run()[0] for seed in (31, 32))
     assert diagnose(second, identify(first, kit.model()).model).verdict == "sufficient"

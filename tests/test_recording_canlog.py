@@ -98,19 +98,6 @@ def test_what_is_recorded_is_read_back_also_without_its_end(suffix, ended, tmp_p
     assert all(abs(b.stamp_ns - f.stamp_ns - first) < 2000 for b, f in zip(back, frames, strict=True))
 
 
-def test_a_binary_log_cut_off_anywhere_gives_what_is_whole(tmp_path):
-    """Text logs are cut at every byte in test_recording_limits."""
-    frames = many_frames(1200)
-    path = recorded(tmp_path / "x.blf", frames, 200)
-    whole = path.read_bytes()
-    rng = random.Random(2)
-    for _ in range(12):
-        path.write_bytes(whole[: rng.randrange(len(whole) // 2, len(whole))])
-        back = list(read_frames(path))
-        assert len(back) > 300
-        assert [(f.can_id, f.data) for f in back] == [(f.can_id, f.data) for f in frames[: len(back)]]
-
-
 def test_of_several_channels_the_configured_one_is_taken(tmp_path):
     path = tmp_path / "x.log"
     lines = [f"({k}.{c}00000) can{c} 18{c}#0{c}\n" for k in range(20) for c in (0, 1)]

@@ -113,24 +113,6 @@ def test_an_eds_file_has_the_nameplate_of_its_device():
     assert "[608Fsub1]" in strict and "DefaultValue=0x2000" in strict.split("[608Fsub1]")[1][:160]
 
 
-@pytest.mark.parametrize("eds", EDS)
-def test_an_eds_file_lists_what_it_describes(eds):
-    text = (eds_directory() / eds).read_text(encoding="ascii")
-    sections = [line.strip("[]") for line in text.splitlines() if line.startswith("[")]
-    assert len(sections) == len(set(sections))
-    listed = [line.split("=0x")[1] for line in text.splitlines() if line[0:1].isdigit() and "=0x" in line]
-    assert sorted(listed) == sorted(s for s in sections if len(s) == 4)
-    counts = [int(line.split("=")[1]) for line in text.splitlines() if line.startswith("SupportedObjects")]
-    assert sum(counts) == len(listed)
-    assert counts[0] == 3  # 0x1000, 0x1001, 0x1018 are mandatory
-    for section in (s for s in sections if len(s) == 4):
-        subs = [s for s in sections if s.startswith(f"{section}sub")]
-        block = text.split(f"[{section}]\n")[1].split("\n\n")[0]
-        assert ("SubNumber" in block) == bool(subs)
-        assert not subs or f"SubNumber={len(subs)}" in block
-    assert "CompactSubObj" not in text
-
-
 @pytest.mark.parametrize("interface", BUSES)
 def test_a_master_maps_saves_reads_back_and_receives(interface):
     rig = StubRig()

@@ -26,6 +26,7 @@ from drivelink import jointfile, recording
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.apply_diagnosis import diagnosed_model
 from drivelink.output import report
+from drivelink.output.document import write
 from estimator import EstimatorSettings, ExternalStatus, LinkDynamics, Status, make_estimator
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.frame import Corrections, Frame, Signals
@@ -188,7 +189,7 @@ def diagnosed(run: Run, data: Path, out: Path) -> dict[str, Any]:
     folder = out / f"{run.joint}-{Path(run.train).stem}-{Path(run.validation).stem}"
     folder.mkdir(parents=True, exist_ok=True)
     title = report.Title(run.joint, Path(run.train).name, Path(run.validation).name)
-    report.write(report.as_json(outcome), report.html_page(outcome, title), folder)
+    write(folder, "report", report.as_json(outcome), report.html_page(outcome, title))
     return {
         **run._asdict(),
         "sensor": sensor,

@@ -17,7 +17,7 @@ from drivelink.jointfile.apply_diagnosis import as_read, diagnosed_model, floor_
 from drivelink.output import fitreport, plots, report, sentences
 from drivelink.output import motion as motions
 from drivelink.output.comparison import beside
-from drivelink.output.document import Section
+from drivelink.output.document import Section, write
 from drivelink.output.numbers import Units
 from drivelink.recording.columns import parse_column_map
 from drivelink.recording.corrections import gate
@@ -220,7 +220,7 @@ class Diagnosed:
         record = self.runs.records[0] if self.held is None else self.held
         made = beside(self.runs.named, joint.model(), written, record, self.runs.units)
         more = [*([] if self.motion is None else [motions.section(self.motion, self.runs.units)]), *made]
-        return report.write(self.as_json(), report.html_page(self.documented, title, more), out)
+        return write(out, "report", self.as_json(), report.html_page(self.documented, title, more))
 
     def next_motion(
         self, seconds: float = 12.0, progress: Callable[[str], None] = lambda _: None

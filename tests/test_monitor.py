@@ -56,6 +56,7 @@ def filled(motors=2, truth=False, n=4000):
         e = estimate(k, motors)
         view.update(e, k * 1e-3, Truth(e[2] * 1.01, e[3] * 1.002) if truth else None)
     view.status = STATUS
+    view.errors = (0.002, 0.01) if truth else view.errors
     return view
 
 

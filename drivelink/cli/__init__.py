@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import logging
 import math
 import os
@@ -16,7 +17,7 @@ import re
 import signal
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
@@ -30,6 +31,7 @@ from estimator.errors import EstimatorError
 
 if TYPE_CHECKING:
     from drivelink.jointfile import JointFile
+    from drivelink.output.document import Section
 
 VERBS = {
     "demo": "everything without hardware: simulated drives, daemon, subscriber, live view",
@@ -124,10 +126,7 @@ def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     for name, summary in VERBS.items():
         subparser = subparsers.add_parser(
-            name,
-            help=summary,
-            description=summary[0].upper() + summary[1:] + ".",
-            formatter_class=_Help,
+            name, help=summary, description=summary[0].upper() + summary[1:] + ".", formatter_class=_Help
         )
         if name in verbs:
             module: Verb = importlib.import_module(f"drivelink.cli.{name}")  # type: ignore[assignment]
@@ -239,6 +238,24 @@ def warn(path: Path, lines: Sequence[str]) -> None:
     """Print what the gate says of a recording, on stderr."""
     for line in lines:
         print(f"{path}: warning: {line}", file=sys.stderr)
+
+
+def conclude(as_json: bool, content: Mapping[str, Any], sections: Iterable[Section]) -> None:
+    """Print a verb's result: a JSON object alone, or tables."""
+    if as_json:
+        print(json.dumps(content))
+        return
+    from rich.console import Console
+
+    from drivelink.output.document import show
+
+    show(sections, Console())
+
+
+def wrote(as_json: bool, paths: Iterable[Path]) -> None:
+    """Name the files that were written."""
+    for path in () if as_json else paths:
+        print(f"wrote {path}")
 
 
 def add_number(

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
-from rich.console import Console
-
-from drivelink.cli import add_map, add_number
+from drivelink.cli import add_map, add_number, conclude, wrote
 from drivelink.errors import RecordingError
-from drivelink.files import write_whole
 
 EPILOG = """\
 examples:
@@ -46,21 +42,12 @@ def run(args: argparse.Namespace) -> int:
         if not path.exists():
             raise RecordingError(f"{path}: no such file")
     from drivelink.comparison import compare  # takes a second; the arguments are checked
-    from drivelink.output.document import page, show
+    from drivelink.output.document import page, write
 
     made = compare(args.a, args.b, args.joint, names=args.map, horizon_s=args.horizon)
-    document = made.as_json()
-    if args.json:
-        print(json.dumps(document))
-    else:
-        show(made.document().sections, Console())
+    content, document = made.as_json(), made.document()
+    conclude(args.json, content, document.sections)
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)
-        for name, text in (
-            ("comparison.json", json.dumps(document, indent=2) + "\n"),
-            ("comparison.html", page(made.document())),
-        ):
-            write_whole(args.out / name, text, force=True)
-            if not args.json:
-                print(f"wrote {args.out / name}")
+        wrote(args.json, write(args.out, "comparison", content, page(document)))
     return 0

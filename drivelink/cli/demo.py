@@ -47,10 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"{', '.join(CASES)} (default: %(default)s)",
     )
     add_number(
-        parser,
-        "--seconds",
-        metavar="S",
-        help="of the run (default: 10; where the loop closes, at most 180)",
+        parser, "--seconds", metavar="S", help="of the run (default: 10; where the loop closes, at most 180)"
     )
     parser.add_argument("--yes", action="store_true", help="accept without asking, where the loop closes")
     parser.add_argument("--headless", action="store_true", help="plain lines instead of the live view")

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
-from rich.console import Console
-
 from drivelink import analysis
-from drivelink.cli import add_number, add_recordings, require_distinct, warn
+from drivelink.cli import add_number, add_recordings, conclude, require_distinct, warn, wrote
 from drivelink.errors import HarmfulModelError, UsageError
 from drivelink.files import check_target
-from drivelink.output.document import show
 from drivelink.output.progress import Meter
 from drivelink.recording.mapping import joint_of
 
@@ -99,12 +95,8 @@ def run(args: argparse.Namespace) -> int:
             made.append(found.write(args.write, force=args.force))
         except HarmfulModelError as error:
             harmful = error  # what was found comes first
-    if args.json:
-        print(json.dumps(found.as_json()))
-    else:
-        show(found.sections(), Console())
-        for path in made:
-            print(f"wrote {path}")
+    conclude(args.json, found.as_json(), found.sections())
+    wrote(args.json, made)
     if harmful is not None:
         raise harmful
     return 0

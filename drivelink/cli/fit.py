@@ -6,10 +6,8 @@ import argparse
 import json
 from pathlib import Path
 
-from rich.console import Console
-
 from drivelink import jointfile
-from drivelink.cli import add_recordings, require_distinct, warn
+from drivelink.cli import add_recordings, conclude, require_distinct, warn, wrote
 from drivelink.errors import RecordingError, UsageError
 from drivelink.files import check_target, write_whole
 from drivelink.recording.mapping import joint_of
@@ -62,17 +60,13 @@ def run(args: argparse.Namespace) -> int:
 def _fit(args: argparse.Namespace, folder: Path | None) -> None:
     """Fit, print, and write the requested files, plots into `folder`."""
     from drivelink import analysis  # takes a second; the arguments are checked
-    from drivelink.output.document import show
     from drivelink.output.fitreport import sections
 
     options = {"bandwidth_hz": args.bandwidth_hz, "names": args.map, "strict": args.strict}
     made = analysis.fit(args.recording, args.joint, warn=warn, **options)
     document = made.as_json()
-    if args.json:
-        print(json.dumps(document))
-    else:  # before anything is written: a full disk loses no result
-        units = made.runs.units
-        show(sections(made.found, [path.name for path in args.recording], units), Console())
+    tables = sections(made.found, [path.name for path in args.recording], made.runs.units)
+    conclude(args.json, document, tables)  # before anything is written: a full disk loses no result
     written = []
     if args.out is not None:
         written.append(args.out / "fit.json")
@@ -85,5 +79,4 @@ def _fit(args: argparse.Namespace, folder: Path | None) -> None:
         written.append(made.plot().save(folder / "fit.png"))
     if args.write is not None:
         written.append(made.write(args.write, force=args.force))
-    for path in [] if args.json else written:
-        print(f"wrote {path}")
+    wrote(args.json, written)

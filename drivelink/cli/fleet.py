@@ -75,9 +75,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="processes on this machine (default: one per CPU core)",
     )
     parser.add_argument(
-        "--memory",
-        metavar="SIZE",
-        help="limit of each worker, e.g. 2GiB; a larger recording is split",
+        "--memory", metavar="SIZE", help="limit of each worker, e.g. 2GiB; a larger recording is split"
     )
     parser.add_argument(
         "--validate",

@@ -62,11 +62,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_seconds(parser)
     add_number(
-        parser,
-        "--every",
-        default=1.0,
-        metavar="S",
-        help="interval of the plain lines (default: %(default)s)",
+        parser, "--every", default=1.0, metavar="S", help="interval of the plain lines (default: %(default)s)"
     )
     parser.add_argument(
         "--allow-accept",

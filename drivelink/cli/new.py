@@ -45,10 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--name", help="name of the joint")
     parser.add_argument("--arrangement", choices=_ARRANGEMENTS, help="how the motors act on the joint")
     add_number(
-        parser,
-        "--rotor-inertia",
-        metavar="G_CM2",
-        help="rotor inertia of each motor, g·cm² (data sheet)",
+        parser, "--rotor-inertia", metavar="G_CM2", help="rotor inertia of each motor, g·cm² (data sheet)"
     )
     add_number(parser, "--inertia", metavar="KG_M2", help="instead: inertia of each motor, joint side")
     add_number(

@@ -68,10 +68,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_bus(parser)
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
     parser.add_argument(
-        "--layouts",
-        type=Path,
-        metavar="DIR",
-        help="write layouts of Foxglove and PlotJuggler there",
+        "--layouts", type=Path, metavar="DIR", help="write layouts of Foxglove and PlotJuggler there"
     )
     parser.add_argument("--json", action="store_true", help="print what was recorded as one JSON object")
 

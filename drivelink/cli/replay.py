@@ -77,12 +77,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_target(args.out, [args.file, *([args.joint] if args.joint else [])], force=args.force)
     playback = open_playback(
-        args.file,
-        joint,
-        base_dir,
-        frames=True if args.frames else None,
-        channel=args.channel,
-        names=names,
+        args.file, joint, base_dir, frames=True if args.frames else None, channel=args.channel, names=names
     )
     summary = Summary(playback.motors, playback.pipeline.estimator, keep=args.plots is not None)
     begin = time.perf_counter()
@@ -154,11 +149,7 @@ def _play(playback: Playback, takers: Sequence[Taker], title: str) -> bool:
 
 
 def _publication(
-    args: argparse.Namespace,
-    joint: JointFile,
-    base_dir: Path,
-    playback: Playback,
-    stack: ExitStack,
+    args: argparse.Namespace, joint: JointFile, base_dir: Path, playback: Playback, stack: ExitStack
 ) -> Publication:
     """Pacing and, on request, the keys on zenoh; both end with the stack."""
     publisher = None

@@ -45,9 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_bus(parser)
     parser.add_argument("--no-publish", action="store_true", help="compute, but publish nothing")
     parser.add_argument(
-        "--no-realtime",
-        action="store_true",
-        help="do not ask for real-time scheduling and locked memory",
+        "--no-realtime", action="store_true", help="do not ask for real-time scheduling and locked memory"
     )
     parser.add_argument(
         "--log-level", choices=_LEVELS, default="info", help="least severe messages that go to stderr"

@@ -64,11 +64,7 @@ def run(args: argparse.Namespace) -> int:
         joints = [_moving(joint, args.motion) for joint in joints]
     section = _bus_section(joints, args)
     bench = bench_from_joints(
-        joints,
-        effects=args.effect,
-        quirks=args.quirks,
-        seed=args.seed,
-        files=args.joints,
+        joints, effects=args.effect, quirks=args.quirks, seed=args.seed, files=args.joints
     )
     for joint, path in zip(joints, args.joints, strict=True):
         for line in assumptions(joint):

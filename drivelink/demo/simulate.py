@@ -49,11 +49,7 @@ _ASSUMED: dict[str, Callable[[float, int], dict[str, float | tuple[float, ...]]]
 
 
 def world_from_joint(
-    joint: JointFile,
-    *,
-    effects: Sequence[str] = (),
-    seed: int | None = None,
-    file: Path | None = None,
+    joint: JointFile, *, effects: Sequence[str] = (), seed: int | None = None, file: Path | None = None
 ) -> World:
     """Return the world that a joint file describes, at rest.
 

@@ -122,6 +122,7 @@ class DemoRun:
         if self.comparison.latest is not None:
             last, truth = self.comparison.latest
             self._view.update(last, last.sequence * self._period_s, truth)
+            self._view.errors = self.comparison.errors()[1:3]
         if not self._live and time.monotonic() >= self._next_line_s:
             self._next_line_s = time.monotonic() + _LINE_S
             sys.stderr.write(f"{self._view.line()}\n")

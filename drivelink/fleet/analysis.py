@@ -35,11 +35,7 @@ class Analysis(NamedTuple):
 
 
 def analyse(
-    record: Record,
-    joint: JointFile,
-    validation: Record | None,
-    title: report.Title,
-    remarks: Sequence[str],
+    record: Record, joint: JointFile, validation: Record | None, title: report.Title, remarks: Sequence[str]
 ) -> Analysis:
     """Fit and diagnose one record.
 

@@ -163,11 +163,7 @@ class JointHistory:
     def add_external(self, message: ExternalMessage, time_s: float) -> None:
         """Enter one external torque; a contact is never thinned out."""
         self.touch = Touch(
-            time_s,
-            message.external_torque_nm,
-            message.external_torque_std_nm,
-            message.valid,
-            message.contact,
+            time_s, message.external_torque_nm, message.external_torque_std_nm, message.valid, message.contact
         )
         last = self.touches[-1] if self.touches else None
         if last is not None and time_s < last.time_s:  # the daemon restarted
@@ -198,18 +194,6 @@ class JointHistory:
         since = self.moments[-1].time_s - self.seconds
         return [moment for moment in self.moments if moment.time_s >= since]
 
-    def relative_errors(self) -> tuple[float, float]:
-        """Return the relative rms error of (stiffness, torque) against the truth over the
-        valid part of the window.
-
-        NaN without truth.
-        """
-        window = [moment for moment in self.window() if moment.valid]
-        return (
-            _relative([(m.stiffness_nm_rad, m.true_stiffness_nm_rad) for m in window]),
-            _relative([(m.torque_nm, m.true_torque_nm) for m in window]),
-        )
-
 
 def usual_range(values: Sequence[float]) -> tuple[float, float]:
     """Return the range of a plot: that of all but the outermost values, extended to those by at most half.
@@ -225,12 +209,6 @@ def usual_range(values: Sequence[float]) -> tuple[float, float]:
     reach = 0.5 * (high - low)
     low, high = max(known[0], low - reach), min(known[-1], high + reach)
     return (low, high) if math.isfinite(high - low) else (math.nan, math.nan)
-
-
-def _relative(pairs: list[tuple[float, float]]) -> float:
-    known = [(value, true) for value, true in pairs if math.isfinite(value) and math.isfinite(true)]
-    power = sum(true**2 for _, true in known)
-    return math.sqrt(sum((value - true) ** 2 for value, true in known) / power) if power else math.nan
 
 
 _POINTS = 60

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.panel import Panel
@@ -40,10 +40,7 @@ _HELP = (
     ("torque", "flexibility torque of the joint, N·m"),
     ("external", "external torque on the link, N·m, ± half its 95 % interval"),
     ("deflection", "φ = q − θ of each transmission, rad"),
-    (
-        "left plot",
-        "stiffness over deflection, band dotted, ● now; cyan motor 1, magenta 2; grey dots: model",
-    ),
+    ("left plot", "stiffness over deflection, band dotted, ● now; cyan motor 1, magenta 2; grey dots: model"),
     ("right plot", "flexibility torque over time; yellow: truth of a simulation; grey: not valid"),
     ("cycle", "99th percentiles, µs: work, answer (SYNC to last frame), SYNC late by"),
     ("residual", "residual over its baseline (of the fit): half a bar is 1"),
@@ -52,14 +49,6 @@ _HELP = (
     ("observable", "the motion reveals the stiffness; else it is held, and its interval widens"),
     ("model alarm", MODEL_ALARM_ADVICE),
 )
-
-
-class _Instant(NamedTuple):
-    """One point of a curve over time."""
-
-    time_s: float
-    value: float
-    valid: bool
 
 
 class JointView:
@@ -78,6 +67,8 @@ class JointView:
         self._status: Mapping[str, Any] = {}
         self.model: Mapping[str, Any] = {}  # the model document, or empty
         self.finding: Mapping[str, Any] = {}  # the newest finding, or empty
+        # relative rms errors of stiffness and torque against the truth of a simulation, or nan
+        self.errors = (math.nan, math.nan)
         self.gone = False  # the daemon has ended or died
         self.hint = ""  # why there is no estimate, or empty
         self.silent_s = 0.0  # time since the last estimate
@@ -147,9 +138,8 @@ class JointView:
             "deflection " + " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions),
             "rad, " + ", ".join(text for text, _ in self.flags),
         ]
-        stiffness, _ = self.history.relative_errors()
-        if math.isfinite(stiffness):
-            parts[-1] += f", stiffness error {100 * stiffness:.2f} %"
+        if math.isfinite(self.errors[0]):
+            parts[-1] += f", stiffness error {100 * self.errors[0]:.2f} %"
         if self.status:
             parts[-1] += f", {status_text(self.status, self.model, self.finding)}"
         return " ".join(parts)
@@ -199,16 +189,15 @@ class JointView:
             waiting.add_row(Text("waiting for the first estimate …", style="dim"))
             return waiting
         last = window[-1]
-        errors = self.history.relative_errors()
         spark = max(6, width - 69)
         ink = ESTIMATE if self.live and last.valid else "dim"
         known = math.isfinite(last.true_stiffness_nm_rad)
         stiffness, half = value_and_interval(last.stiffness_nm_rad, half_interval(estimate))
         band = f" ± {half}" if half else ""
         for label, value, extra, unit, true, error, series in (
-            ("stiffness", stiffness, band, "N·m/rad", last.true_stiffness_nm_rad, errors[0],
+            ("stiffness", stiffness, band, "N·m/rad", last.true_stiffness_nm_rad, self.errors[0],
              [m.stiffness_nm_rad if m.valid else math.nan for m in window]),
-            ("torque", number(last.torque_nm), "", "N·m", last.true_torque_nm, errors[1],
+            ("torque", number(last.torque_nm), "", "N·m", last.true_torque_nm, self.errors[1],
              [m.torque_nm if m.valid else math.nan for m in window]),
         ):  # fmt: skip
             table.add_row(
@@ -305,44 +294,40 @@ class JointView:
         width: int,
         height: int,
         title: str,
-        series: Sequence[_Instant],
+        series: Sequence[tuple[float, float, bool]],
         truth: Sequence[float] = (),
         empty: str = "",
     ) -> Text:
-        """A quantity over time; what is not valid is grey and sets no scale beside what is."""
-        end = series[-1].time_s if series else 0.0
-        values = [one.value for one in series if one.valid] or [one.value for one in series]
+        """(time, value, valid) over time; what is not valid is grey and sets no scale beside what is."""
+        end = series[-1][0] if series else 0.0
+        values = [value for _, value, valid in series if valid] or [value for _, value, _ in series]
         known = [value for value in (*values, *truth) if math.isfinite(value)]
         plot = DotPlot(width, height, (-self.history.seconds, 0.0), usual_range(known))
         if truth:
-            times = [one.time_s - end for one in series]
+            times = [time_s - end for time_s, *_ in series]
             plot.curve(list(zip(times, truth, strict=True)), TRUTH)
         for wanted, ink in ((False, _GREY), (True, ESTIMATE)):
-            points = [(p.time_s - end, p.value if p.valid is wanted else math.nan) for p in series]
-            plot.curve(points, ink)
+            plot.curve([(t - end, value if valid is wanted else math.nan) for t, value, valid in series], ink)
         if not known:
             plot.note(empty or self._why_empty())
         return plot.render(title, "s")
 
     def _torque_plot(self, width: int, height: int) -> Text:
-        window = self.history.window()
-        series = [_Instant(m.time_s, m.torque_nm, m.valid) for m in window]
-        truth = [m.true_torque_nm for m in window]
-        return self._time_plot(width, height, "torque over time, N·m", series, truth)
+        moments = [(m.time_s, m.torque_nm, m.valid) for m in self.history.window()]
+        truth = [m.true_torque_nm for m in self.history.window()]
+        return self._time_plot(width, height, "torque over time, N·m", moments, truth)
 
     def _stiffness_plot(self, width: int, height: int) -> Text:
-        window = self.history.window()
-        series = [_Instant(m.time_s, m.stiffness_nm_rad, m.valid) for m in window]
-        truth = [m.true_stiffness_nm_rad for m in window]
-        return self._time_plot(width, height, "stiffness over time, N·m/rad", series, truth)
+        moments = [(m.time_s, m.stiffness_nm_rad, m.valid) for m in self.history.window()]
+        truth = [m.true_stiffness_nm_rad for m in self.history.window()]
+        return self._time_plot(width, height, "stiffness over time, N·m/rad", moments, truth)
 
     def _last_plot(self, width: int, height: int) -> Text:
         """The external torque where the link is known, else the residual."""
-        touches = self.history.touches
-        if touches:
-            series = [_Instant(t.time_s, t.torque_nm, t.valid) for t in touches]
+        if touches := self.history.touches:
+            series = [(t.time_s, t.torque_nm, t.valid) for t in touches]
             return self._time_plot(width, height, "external torque over time, N·m", series)
-        series = [_Instant(time_s, ratio, True) for time_s, ratio in self.history.residuals]
+        series = [(time_s, ratio, True) for time_s, ratio in self.history.residuals]
         title, empty = "residual over time, × its baseline", "no baseline: drivelink fit --write makes one"
         return self._time_plot(width, height, title, series, empty=empty)
 

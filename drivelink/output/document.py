@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import html
+import html as markup
+import json
 import textwrap
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from string import Template
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from drivelink.files import write_whole
 from drivelink.output import plots
 from drivelink.output.numbers import Units
 from drivelink.plaintext import spelt
@@ -137,6 +139,14 @@ def _printed(grid: Grid, title: str, console: Console) -> Table:
     return table
 
 
+def write(folder: Path, stem: str, content: Mapping[str, Any], html: str) -> list[Path]:
+    """Write what a verb reports, as JSON and as a page; return both paths."""
+    made = [folder / f"{stem}.{kind}" for kind in ("json", "html")]
+    for path, text in zip(made, (json.dumps(content, indent=2) + "\n", html), strict=True):
+        write_whole(path, text, force=True)
+    return made
+
+
 def page(document: Document) -> str:
     """Draw a document as one self-contained page."""
     template = Template(Path(__file__).with_name("document.html").read_text(encoding="utf-8"))
@@ -199,7 +209,7 @@ def _cell(cell: Cell) -> str:
 
 
 def _escaped(text: str) -> str:
-    return html.escape(text, quote=False)
+    return markup.escape(text, quote=False)
 
 
 def _text(cell: Cell) -> str:

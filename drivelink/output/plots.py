@@ -191,12 +191,7 @@ def _finish(axes: Axes, x_label: str, y_label: str, title: str, legend: bool) ->
         axes.set_title(title, loc="left", pad=20.0 if named else None)
     if named:  # on a line of its own between title and axes
         axes.legend(
-            loc="lower left",
-            bbox_to_anchor=(0.0, 1.0),
-            ncols=6,
-            frameon=False,
-            fontsize=8,
-            borderaxespad=0.2,
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, frameon=False, fontsize=8, borderaxespad=0.2
         )
 
 

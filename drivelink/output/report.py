@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from drivelink.files import write_whole
 from drivelink.output import plots
 from drivelink.output.document import (
     PARAMETER_HEAD,
@@ -64,16 +61,6 @@ class Title(NamedTuple):
     recording: str
     validation: str | None
     linear: bool = False
-
-
-def write(document: Mapping[str, Any], html: str, folder: Path) -> list[Path]:
-    """Write report.json and report.html."""
-    made = []
-    for name, text in (("report.json", json.dumps(document, indent=2) + "\n"), ("report.html", html)):
-        path = folder / name
-        write_whole(path, text, force=True)
-        made.append(path)
-    return made
 
 
 def as_json(outcome: Diagnosis) -> dict[str, Any]:

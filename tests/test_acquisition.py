@@ -60,6 +60,16 @@ def test_while_late_frames_are_still_to_come_none_is_believed_without_a_flag():
     assert assembler.flags == 0
 
 
+def test_who_repeats_himself_after_lost_frames_is_not_a_node_that_is_late():
+    """After SYNCs that the nodes did not see, somebody sends the same twice with the identifier of one."""
+    assembler, foreign = Assembler(VSA, 2), (0x183, link(70_000))
+    run(assembler, [(SYNC, b""), *vsa_cycle(0)])
+    run(assembler, [(SYNC, b"")] * 5)
+    given = [s for k in range(6, 60) for s in run(assembler, [(SYNC, b""), *vsa_cycle(k), foreign, foreign])]
+    assert all(s.link_position_rad < 100 * LINK_RAD for s in given)
+    assert assembler.counters[3].conflicting > 0
+
+
 def test_a_node_that_was_configured_again_owes_nothing():
     assembler = Assembler(VSA, 2)
     for k in range(5):

@@ -82,7 +82,7 @@ def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(able
         heartbeat.restart()
         if not able:
             heartbeat._period.changed = lambda: None
-        made.run(ENOUGH if able else 8000 + ENOUGH)
+        made.run(2 * ENOUGH if able else 8000 + ENOUGH)
         said = [text for text in made.events if text.startswith("node 2")]
         assert sum("is configured again" in text for text in said) == 1
         assert (said[-1] == "node 2: heartbeat is back") == able

@@ -191,6 +191,7 @@ impl Assembler {
         self.awaited = 0;
         for decoder in &mut self.decoders {
             decoder.arrived = false;
+            decoder.replaced = false;
             self.awaited += usize::from(decoder.timed());
         }
     }
@@ -310,6 +311,10 @@ impl Assembler {
         let decoder = &mut self.decoders[index];
         let counters = &mut self.nodes[decoder.node].counters;
         let same = decoder.repeats(data);
+        if same && decoder.replaced {
+            decoder.conflict = CONFLICT_CYCLES; // somebody may repeat himself after the one that belongs to it
+            self.spoiled = true;
+        }
         if decoder.suspect > 0 && same {
             counters.duplicate += 1; // the same once more settles nothing
             return false;
@@ -321,6 +326,7 @@ impl Assembler {
                 decoder.suspect = 0;
             }
             counters.late += 1;
+            decoder.replaced = true;
             self.cycle_fault = true;
             return true;
         }

@@ -129,6 +129,8 @@ pub struct TpdoDecoder {
     pub suspect: u32,
     /// Frames that were missing and have not come late: so many may still be on their way.
     pub owed: u32,
+    /// In this cycle, a frame was taken for a late one because another one came.
+    pub replaced: bool,
     /// Periods since the last one.
     pub silent: i64,
     /// Cycles for which two different frames in one cycle still discredit it.
@@ -169,6 +171,7 @@ impl TpdoDecoder {
             heard: false,
             suspect: 0,
             owed: 0,
+            replaced: false,
             silent: 0,
             conflict: 0,
             last: ([0; MOST_BYTES], 0),

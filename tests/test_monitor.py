@@ -21,7 +21,7 @@ from drivelink import cli
 from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
 from drivelink.monitor.statuslines import shape, status_lines
-from drivelink.monitor.terminal import joints_table
+from drivelink.monitor.terminal import can_draw, joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.web import snapshot
 from drivelink.output.numbers import number, with_interval
@@ -250,6 +250,13 @@ def test_a_joint_that_nobody_serves_is_not_live_and_the_nearest_is_named(daemon,
     displayed = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert displayed["joint"] == "elbwo" and not displayed["live"] and "estimate" not in displayed
     assert displayed["state"] == 'no daemon of "elbwo"; did you mean "elbow"? there is elbow'
+
+
+def test_a_live_view_needs_a_terminal_with_its_characters():
+    for encoding, able in (("utf-8", True), ("ascii", False), ("latin-1", False)):
+        file = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+        assert can_draw(Console(file=file, force_terminal=True)) is able
+        assert not can_draw(Console(file=file, force_terminal=False))
 
 
 def test_plain_lines_repeat_nothing_and_end_where_nobody_serves_the_joint(daemon, capsys, monkeypatch):

@@ -19,6 +19,7 @@ from drivelink.demo import closedloop
 from drivelink.demo.closing import as_json, closing
 from drivelink.demo.watching import DemoRun, rig_process
 from drivelink.errors import DrivelinkError
+from drivelink.monitor.terminal import can_draw
 from drivelink.output.document import show
 from drivelink.pubsub.client import subscribe
 
@@ -58,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     """Run one case and compare truth and estimate."""
     logging.getLogger("drivelink.client").setLevel(logging.ERROR)  # its daemon comes, however late
     console = Console()
-    live = console.is_terminal and not args.headless and not args.json
+    live = can_draw(console) and not args.headless and not args.json
     if args.case in closedloop.CASES:
         return _closed_loop(args, console, live=live)
     seconds = args.seconds or _SECONDS

@@ -18,7 +18,7 @@ from drivelink.cli import add_number, add_seconds
 from drivelink.errors import UsageError, ZenohError
 from drivelink.loop.finding import folder_of
 from drivelink.monitor.statuslines import shape
-from drivelink.monitor.terminal import Keys, joints_table
+from drivelink.monitor.terminal import Keys, can_draw, joints_table
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import WebView, document
 from drivelink.monitor.webaccept import WebAcceptance
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
         stack.enter_context(suppress(KeyboardInterrupt))
         if args.web:
             _serve(watcher, args, end, acceptance)
-        elif (console := Console()).is_terminal and not (args.json or console.options.ascii_only):
+        elif not args.json and can_draw(console := Console()):
             _show(watcher, console, end, f"{prefix}/{name or '*'} at {config or endpoint}")
         else:
             _print(watcher, end, args, f"{config or endpoint}")

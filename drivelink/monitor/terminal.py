@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self
 
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -51,6 +52,11 @@ def joints_table(views: Mapping[str, JointView], width: int) -> Table:
             cells.append(Text(*worst[0]) if worst else Text(view.state or "valid", style="green"))
         table.add_row(*cells)
     return table
+
+
+def can_draw(console: Console) -> bool:
+    """Return whether the console is a terminal that has the characters of the live views."""
+    return console.is_terminal and not console.options.ascii_only
 
 
 class Keys:

@@ -210,13 +210,14 @@ def _reading(frame: Frame, error: FloatArray) -> FloatArray:
     return frame.stack(parts)
 
 
-def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dict[str, float]]:
+def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float, ripples: int) -> list[dict[str, float]]:
     """Start values of the nonlinear parameters.
 
     Args:
         frame: the recording.
         candidate: the effect.
         smoothing_rad_s: velocity below which a sign is lost in noise.
+        ripples: frequencies of a ripple at most, the slowest ones.
     """
     kind = candidate.kind
     c = frame.motors[candidate.motor or 0]
@@ -239,7 +240,7 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
         scales = _spread(path) * np.geomspace(0.0002, choice("slips"), 11 if _spread(path) > 0.0 else 0)
         return [{"displacement_rad": float(d), "exponent": n, "shape": b} for n, b in LAWS for d in scales]
     if kind.name in ("cogging", "kinematic_error"):
-        return _vary(fixed, "periods_per_rev", _waves(frame, c))
+        return _vary(fixed, "periods_per_rev", _waves(frame, c, ripples))
     if kind.name == "backlash":
         gaps = np.quantile(np.abs(c.deflection), np.linspace(0.05, 0.9, 9))
         return _vary(fixed, "half_gap_rad", gaps[gaps > 0.0])
@@ -265,7 +266,7 @@ def _vary(fixed: Values, name: str, values: Iterable[float]) -> list[dict[str, f
     return [{**fixed, name: float(value)} for value in values]
 
 
-def _waves(frame: Frame, c: Coordinates) -> FloatArray:
+def _waves(frame: Frame, c: Coordinates, ripples: int) -> FloatArray:
     """Periods per revolution whose ripple is within the bandwidth for much of the motion."""
     spread = _spread(c.position)
     if spread <= 0.0:
@@ -274,7 +275,7 @@ def _waves(frame: Frame, c: Coordinates) -> FloatArray:
     slow = float(np.quantile(np.abs(c.velocity), 0.4))
     most = 2.0 * np.pi * frame.signals.bandwidth_hz / max(slow, 1e-12)
     step = np.pi / spread
-    count = int(np.clip((most - least) / step, 0, whole("ripples")))
+    count = int(np.clip((most - least) / step, 0, ripples))
     # Once and twice a turn of the output and of the motor, where the motion has a whole period.
     gear = frame.model.motors[[own is c for own in frame.motors].index(True)].gear_ratio
     turns = np.array([1.0, 2.0] if gear is None else [1.0, 2.0, gear, 2.0 * gear])
@@ -302,7 +303,7 @@ def reach_of(frame: Frame, candidate: Candidate, name: str) -> float | None:
     """Prior standard deviation of a nonlinear parameter, in its unit; None: a factor of e either way."""
     c = frame.motors[candidate.motor or 0]
     if name == "periods_per_rev":
-        waves = _waves(frame, c)
+        waves = _waves(frame, c, whole("ripples"))
         return float(np.ptp(waves) / 12.0**0.5) if len(waves) > 1 else 1.0
     if name == "position_rad":
         return float(_spread(c.link_position) / 12.0**0.5)

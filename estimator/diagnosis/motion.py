@@ -257,7 +257,7 @@ def _hidden(problem: Problem, rest: Fitted, candidate: Candidate) -> Fitted:
     """An effect that the motion holds at zero, with the shape that it hides best."""
     each = [
         problem.added(rest, Term(candidate, values), 0)
-        for values in grid(problem.frames[0], candidate, problem.smoothing_rad_s)
+        for values in grid(problem.frames[0], candidate, problem.smoothing_rad_s, whole("ripples"))
     ]
     return max(each, key=lambda one: float(np.sum(_std(one)[[s.kind == "term" for s in one.slots]])))
 

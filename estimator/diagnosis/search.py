@@ -129,7 +129,9 @@ class Search:
     def _enter(self, candidate: Candidate, frames: Sequence[Frame], made: list[FloatArray]) -> None:
         """Add a candidate over its grid to the library, and its columns to those made."""
         problem = self.problem
-        values = grid(frames[0], candidate, problem.smoothing_rad_s)
+        # A fit names no effect: of the ripples only slow ones look like a spring, and may widen its interval.
+        ripples = whole("points" if problem.calibrating else "ripples")
+        values = grid(frames[0], candidate, problem.smoothing_rad_s, ripples)
         if not values:
             return
         each = [np.concatenate([columns(f, candidate, v).T for f in frames], axis=1) for v in values]

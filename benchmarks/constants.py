@@ -5,8 +5,8 @@
 A choice is an entry of `estimator.choices.CHOICES` or `estimator.priors.PRIORS`; `tests/literals.py` says
 what other numbers are. The figures are formed with half and with twice its value (of a share above one half:
 of what it leaves to one), in a forked process, on a few short recordings that are made once. A figure that
-gets worse by more than a fifth names a mechanism to replace, not a number: such changes are shown. What is
-constant in `estimator/core` is compiled, and not varied.
+gets worse by more than a fifth names a mechanism to replace, not a number: such changes are shown. An entry
+of `estimator/core/src/choices.rs` keeps its value where it is compiled: `compiled.py` varies it there.
 """
 
 from __future__ import annotations

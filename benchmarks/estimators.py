@@ -2,6 +2,7 @@
 
     python benchmarks/estimators.py [--mode robust|paper] [--joints 8] [--seconds 20] [--cases NAME,…]
     python benchmarks/estimators.py --undeclared [--motion multisine|point-to-point|hand-guided|…]
+    python benchmarks/estimators.py --mixed [--joints 120] [--first 1]
 
 Fresh joints, read as drives read them: 4096 to 16384 counts (stiff joints behind a gear of 100), 16 to 18
 bits at the link, no velocity, torque noise of 0.1 to 0.5 % of rated. Judged from five seconds on, where the
@@ -11,7 +12,8 @@ gap, to 0.3 of its rms); the share of its 95 % intervals that hold the slope.
 The joints are those of an independent simulator in C (`world.c`). With --undeclared they have cubic springs
 whose order is declared, and an effect of 3 to 8 % of the torque's amplitude that no file names. Names are
 counted by joints: in the end, and those that are given up again; the time is the median to the first of
-either.
+either. With --mixed a spring, its declaration, an effect and a motion are drawn for each joint, from the easy
+to the hopeless; wrong is what is off by more than a tenth and by more than three standard deviations.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ from estimator.sample import SIGMA_95
 
 SETTLED_S = 5.0  # the estimate is judged from there on
 USABLE = int(Status.VALID | Status.OBSERVABLE)
+WRONG = 0.1  # of the stiffness
 OFF = (0.8, 1.2)  # k, and the shape above its lower bound, of a declaration that is 20 % off
 
 
@@ -105,6 +108,7 @@ def effects(rng: np.random.Generator, rated: float, stiffness: float) -> dict[st
 
 
 EFFECTS = tuple(effects(np.random.default_rng(0), 1.0, 1.0))
+MOTIONS = ("multisine", "point-to-point", "hand-guided", "pushes", "harmonic")
 
 
 class Drawn(NamedTuple):
@@ -187,7 +191,7 @@ def online(joint: Drawn, mode: str) -> scene.Row:
         "us": 1e6 * spent_s / len(truth),
         "false_alarms": int(np.sum(changed[1:] & ~changed[:-1])),
         "usable": float(np.mean(chosen[round(SETTLED_S / T) :])),
-        **dict.fromkeys(("rmse", "std", "coverage"), np.nan),
+        **dict.fromkeys(("rmse", "std", "coverage", "wrong"), np.nan),
         "names": sorted(last),
         "meanwhile": sorted(named - last),
         "named_after_s": after,
@@ -200,7 +204,28 @@ def online(joint: Drawn, mode: str) -> scene.Row:
         "rmse": float(np.sqrt(np.mean((error / size) ** 2))),
         "std": float(np.median(std / size)),
         "coverage": float(np.mean(np.abs(error) < SIGMA_95 * std)),
+        "wrong": float(np.mean((np.abs(error) > WRONG * size) & (np.abs(error) > 3.0 * std))),
     }
+
+
+def mixed(args) -> Iterator[scene.Row]:
+    """One row a motion: random springs, declarations, effects; shares are of all usable time."""
+    made: dict[str, list[scene.Row]] = {motion: [] for motion in MOTIONS}
+    for seed in range(args.first, args.first + args.joints):
+        rng = np.random.default_rng([seed, 1])
+        case, effect, motion = (str(rng.choice(list(names))) for names in (CASES, EFFECTS, MOTIONS))
+        found = online(drawn(CASES[case], effect, seed, args.seconds, motion), args.mode)
+        made[motion].append(found)
+        if found["wrong"] > 0.0:
+            said = f"{seed}: {case}, {effect}, {motion}: {found['wrong']:.1%} of {found['usable']:.0%} wrong"
+            print(said, file=sys.stderr)
+    for motion, found in (*made.items(), ("all", [one for each in made.values() for one in each])):
+        usable = np.array([one["usable"] for one in found])
+        share = usable / max(usable.sum(), 1e-12)
+        of_usable = {
+            key: float(np.nansum(share * [one[key] for one in found])) for key in ("wrong", "coverage")
+        }
+        yield {"motion": motion, "joints": len(found), "usable": float(np.mean(usable)), **of_usable}
 
 
 def summary(case: str, found: list[scene.Row]) -> scene.Row:
@@ -229,7 +254,10 @@ def summary(case: str, found: list[scene.Row]) -> scene.Row:
 
 
 def rows(args) -> Iterator[scene.Row]:
-    """One row a spring, or with --undeclared an effect."""
+    """One row a spring, or with --undeclared an effect, with --mixed a motion."""
+    if args.mixed:
+        yield from mixed(args)
+        return
     for name in args.cases or (EFFECTS if args.undeclared else CASES):
         case, effect = (CASES["cubic"], name) if args.undeclared else (CASES[name], "nothing")
         seeds = range(args.first, args.first + args.joints)
@@ -253,16 +281,28 @@ NAMED = {
     "first after / s": "{after_s:.0f}",
 }
 
+MIXED = {
+    "motion": "{motion}",
+    "joints": "{joints}",
+    "usable": "{usable:.1%}",
+    "wrong of usable": "{wrong:.2%}",
+    "95 % intervals hold": "{coverage:.1%}",
+}
+
 if __name__ == "__main__":
+    more = NAMED if "--undeclared" in sys.argv else {"µs a tick": "{us:.1f}"}
     scene.main(
         __doc__,
         rows,
-        COLUMNS | (NAMED if "--undeclared" in sys.argv else {"µs a tick": "{us:.1f}"}),
+        MIXED if "--mixed" in sys.argv else COLUMNS | more,
         scene.Option("--mode", ("robust", "paper")),
         scene.Option("--joints", 8),
         scene.Option("--seconds", 20.0),
         scene.Option("--first", 1, "seed of the first joint"),
         scene.Option("--undeclared", False, "effects that no file names"),
-        scene.Option("--motion", ("multisine", "point-to-point", "hand-guided", "pushes", "harmonic")),
+        scene.Option(
+            "--mixed", False, "a spring, a declaration, an effect and a motion drawn for each joint"
+        ),
+        scene.Option("--motion", MOTIONS),
         scene.Option("--cases", [], "of springs or effects; all if left out"),
     )

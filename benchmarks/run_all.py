@@ -48,6 +48,9 @@ SECTIONS = {
         "--joints 1",
         of="estimators",
     ),
+    "mixed": Section(
+        "Random joints, effects and motions", "--mixed --joints 120", "--joints 5", of="estimators"
+    ),
     "diagnosis_seeds": Section(
         "Diagnosis on published seeds", "--seeds 1", "--effects clean,coulomb_friction,backlash"
     ),

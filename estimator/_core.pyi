@@ -10,6 +10,7 @@ from estimator.settings import EstimatorSettings
 
 Numbers = NDArray[float64]
 
+CHOICES: list[tuple[str, float, str, str, str]]
 STOP_EXPONENT: float
 __version__: str
 

@@ -1,6 +1,7 @@
-"""Choices that are neither physics nor priors: one table with reasons for the whole package.
+"""Choices that are neither physics nor priors: one table with reasons for both languages.
 
-Priors are in `estimator.priors`. `python benchmarks/constants.py` halves and doubles each entry of both.
+Those that the on-line estimator makes too are written in `estimator/core/src/choices.rs`; priors are in
+`estimator.priors`. `python benchmarks/constants.py` halves and doubles each entry of all three.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ import math
 from statistics import NormalDist
 from typing import NamedTuple
 
-__all__ = ["CHOICES", "Choice", "chance", "choice", "least_rows", "log_odds", "rate", "whole"]
+from estimator import _core
+
+__all__ = ["CHOICES", "ON_LINE", "Choice", "chance", "choice", "least_rows", "log_odds", "rate", "whole"]
 
 
 class Choice(NamedTuple):
@@ -28,7 +31,9 @@ class Choice(NamedTuple):
     reason: str
 
 
+ON_LINE = {row[0].lower(): Choice(*row[1:]) for row in _core.CHOICES}
 CHOICES: dict[str, Choice] = {
+    **ON_LINE,
     # How a recording becomes rows.
     "harmonics": Choice(
         4.0, "", "bandwidth of what repeats, over its frequency", "friction has harmonics to there"
@@ -51,10 +56,6 @@ CHOICES: dict[str, Choice] = {
     "most_bandwidth": Choice(25.0, "Hz", "asked for at most", "above it joints have modes of their own"),
     "narrowest": Choice(4.0, "Hz", "bandwidth at least, whatever the noise", "below it nothing is known"),
     # Models and their errors.
-    "floor": Choice(0.002, "torque rms", "error that no model gets below", "filters, sampling and rounding"),
-    "exact": Choice(
-        0.0005, "torque rms", "the same of a healthy joint", "filters and sampling leave 0.03 % of exact data"
-    ),
     "law": Choice(
         0.08, "torque of an effect", "error of any textbook law", "friction, play and slip differ by so much"
     ),
@@ -86,8 +87,6 @@ CHOICES: dict[str, Choice] = {
     "beam": Choice(3, "hypotheses", "grown at once", "enough for an imitation beside the true effect"),
     "tried": Choice(8, "effects", "tried beside each", "the families of friction and ripple have six"),
     # Verdicts.
-    "even": Choice(0.05, "probability", "at which another account is an alternative", "one in twenty"),
-    "sure": Choice(3.0, "standard deviations", "at which a reading's error is reported", "one in 400"),
     "groups": Choice(
         10, "", "stretches of time, kinds of motion, knots over time", "more say less each, fewer are unsure"
     ),
@@ -96,9 +95,6 @@ CHOICES: dict[str, Choice] = {
         "it is right within a factor of three: chi-squared of four degrees of freedom",
     ),
     "bootstraps": Choice(200, "", "of the blocks that weigh models", "probabilities to a few per cent"),
-    "far": Choice(
-        10.0, "floor", "what names leave at which something unnamed is missing", "an order of magnitude"
-    ),
     "curve": Choice(
         0.6, "what names leave", "left by a free curve reported instead", "else a name says more"
     ),
@@ -160,7 +156,6 @@ CHOICES: dict[str, Choice] = {
     "free_inertia": Choice(
         2.7, "nats", "more against a declared inertia that is off by any factor", "within 2.5, of six decades"
     ),
-    "accused": Choice(0.001, "probability", "that what is called wrong is right, at most", "one in 1000"),
     "declared_factor": Choice(
         3.0, "", "by which a declared number is off at most", "more is a rotor's inertia, a gear or a unit"
     ),

@@ -84,6 +84,12 @@ PRIORS: dict[str, Prior] = {
     "back_driving_loss": Prior(
         0.36, "absolute", "the same of one that the link drives", "1/e - 1 of the same gears"
     ),
+    "undeclared_effect": Prior(
+        0.05, "torque", "effect that nobody declared, on line", "machines are declared but for so much"
+    ),
+    "declared_law": Prior(
+        0.3, "declared", "parameter of a law that is declared without its deviation", "as of data sheets"
+    ),
     "declared": Prior(
         0.01, "declared", "a declared number, link dynamics declared too", "a rig that has been calibrated"
     ),

@@ -61,7 +61,7 @@ def test_every_number_that_the_estimator_chooses_is_in_a_table():
 
 def test_every_number_inside_the_estimators_functions_has_a_reason_in_both_languages():
     assert list(literals.unexplained(ROOT / "estimator")) == []
-    assert list(literals.uncommented(ROOT / "estimator" / "core" / "src")) == []
+    assert list(literals.untabled(ROOT / "estimator" / "core" / "src")) == []
 
 
 def test_only_the_fleet_imports_what_its_extra_brings():

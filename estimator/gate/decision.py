@@ -338,7 +338,7 @@ def _declared_stiffness(motor: Motor) -> float | None:
 
 def _decisive() -> float:
     """Log odds at which a finding is certain, nats."""
-    return -log_odds(choice("accused"))
+    return math.log(choice("accused"))
 
 
 def _off(ratio: float, factor: float) -> float:

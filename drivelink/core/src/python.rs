@@ -55,7 +55,10 @@ mod extension {
         let messages = crate::wire::MESSAGES.map(|(name, fields)| (name, fields.to_vec()));
         module.add("MESSAGES", HashMap::from(messages))?;
         module.add("LATE", crate::assembler::LATE)?;
-        module.add("LATEST", estimator_core::external::LATEST)?;
+        module.add("LATEST", estimator_core::choices::LATEST)?;
+        let choices = estimator_core::choices::TABLE.iter();
+        let rows = choices.map(|one| (one.name, one.value, one.unit, one.meaning, one.reason));
+        module.add("CHOICES", rows.collect::<Vec<_>>())?;
         module.add("STOP_EXPONENT", estimator_core::memory::STOP_EXPONENT)?;
         module.add("SYNC_COB_ID", crate::assembler::SYNC_COB_ID)?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))

@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::choices::{FAR, GROWN, SLOW};
 use crate::filters::StateVariableFilter;
 use crate::gram::{COLUMNS, Gram, Row};
 use crate::signals::{Channel, Filters, Formed};
@@ -41,11 +42,6 @@ pub const STOPS: std::ops::Range<usize> = 24..27;
 /// −(u clipped at four widths): a spring of any shape, N·m.
 pub const CLIPS: std::ops::Range<usize> = 27..31;
 
-/// Largest |u| that a row may have: beyond it the powers lose the small motions' digits.
-pub const LARGEST: f64 = 1.5;
-
-const FRICTION_SPEED: f64 = 0.02; // of the largest velocity: over which dry friction changes its sign …
-const SOFTER: f64 = 10.0; // … and the same of the softer one: between them lie the usual Stribeck speeds
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
 const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len(); // columns that are functions of the raw φ
@@ -204,13 +200,13 @@ impl Balance {
     /// Whether a deflection has outgrown what the spring's columns are scaled by.
     #[must_use]
     pub fn outgrown(&self, phi: f64) -> bool {
-        phi.abs() > LARGEST * self.size.deflection
+        phi.abs() > GROWN * self.size.deflection
     }
 
     /// Scale memory, friction and the free curve by the motion seen so far; the free curve begins anew.
     pub fn fit_widths(&mut self, phi: f64) {
         let range = 0.5 * (self.high - self.low);
-        let grown = range > LARGEST * self.size.range || self.speed > LARGEST * self.size.speed;
+        let grown = range > GROWN * self.size.range || self.speed > GROWN * self.size.speed;
         if !grown || range <= 0.0 {
             return;
         }
@@ -279,7 +275,7 @@ impl Balance {
         let u = self.unit(phi);
         let slopes = self.family.at(u, self.size.deflection);
         let slope = slopes[TERMS + 1];
-        let speed = (FRICTION_SPEED * self.size.speed).max(f64::MIN_POSITIVE);
+        let speed = (SLOW * self.size.speed).max(f64::MIN_POSITIVE);
         let sign = (rate / speed).tanh();
         let step = (phi - self.last) / self.size.range.max(f64::MIN_POSITIVE);
         self.last = phi;
@@ -288,7 +284,7 @@ impl Balance {
         }
         let [a, b, c] = self.stops;
         let [q, q_rate] = [link.light[0], link.light[1]];
-        let soft = (rate / (SOFTER * speed)).tanh();
+        let soft = (rate / (FAR * speed)).tanh();
         let load = [slopes[0].abs() * sign, slopes[1].abs() * sign];
         let now = [sign, soft, load[0], load[1], -slope * q_rate, -slope * q, -a, -b, -c];
         self.formed.smooth(&filters.main, now);

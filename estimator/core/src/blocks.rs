@@ -8,25 +8,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::balance::{self, Balance};
 use crate::causes::{Noise, Odds};
+use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, REACHED, TAILS, UNUSUAL};
 use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse};
 use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection, TERMS};
 use crate::student::f_quantile;
 use crate::unknowns::{ACTIVE, Spring};
-
-const BLOCK_S: f64 = 0.25; // of motion: longer than the filters' memory, so that blocks are nearly independent
-const BLOCKS: usize = 100; // 25 s of motion: what a joint's temperature and load leave as they are
-const FEWEST: usize = 8; // blocks before one is held against the others
-const WINDOW: usize = 8; // blocks that are not explained, at most: two seconds
-const CONVINCING: usize = 2; // blocks in a row that end a doubt: one may have had little motion
-const QUICK_S: f64 = 0.03; // over which single rows are held against what is known: the filters' memory
-
-const EXPLAINED: f64 = 3.0; // times the usual mean square, that a change of the joint may leave
-const EARLY: f64 = 0.005; // of the torque's fluctuation: what a drive's torque is known to, before any data
-const TAILS: f64 = 8.0; // degrees of freedom of a block's noise level: it varies within a factor of two
-const BURST: f64 = 3.0; // times the largest mean square that was explained: friction comes in bursts, at reversals
-const REACHED: f64 = 0.98; // of where a law ends
 
 /// What a block did.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -132,11 +120,11 @@ impl Blocks {
             rows,
             correlated,
             per_block: (alarms_per_hour * BLOCK_S / 3600.0).clamp(1e-12, 0.5),
-            quick_limit: f_quantile(1.0, FEWEST as f64 * errors, alarms_per_hour * QUICK_S / 3600.0),
+            quick_limit: f_quantile(1.0, FEWEST as f64 * errors, alarms_per_hour * LOOK_S / 3600.0),
             open: Gram::default(),
             ring: Vec::with_capacity(BLOCKS),
             oldest: 0,
-            waiting: Vec::with_capacity(WINDOW),
+            waiting: Vec::with_capacity(FEWEST),
             scores: Vec::with_capacity(BLOCKS),
             carried: None,
             projection: None,
@@ -262,7 +250,7 @@ impl Blocks {
     pub fn add(&mut self, row: &Row) -> Option<Closed> {
         if self.is_reference() {
             let left = dot(row, &self.residual);
-            self.quick += (self.period / QUICK_S).min(1.0) * (left * left - self.quick);
+            self.quick += (self.period / LOOK_S).min(1.0) * (left * left - self.quick);
             if !self.doubting && self.is_beyond(row) {
                 return Some(self.begin_doubt());
             }
@@ -289,7 +277,7 @@ impl Blocks {
         let held = self.peaks.iter().fold(0.0, |most: f64, peak| most.max(*peak));
         let (Some(frame), Some(known)) = (&self.frame, &self.posterior) else { return false };
         let along = frame.directions.map(|direction| dot(row, &direction));
-        self.quick > usual.max(BURST * held) + self.quick_limit * known.variance_along(&along)
+        self.quick > usual.max(UNUSUAL * held) + self.quick_limit * known.variance_along(&along)
     }
 
     fn close(&mut self, block: Gram) -> Closed {

@@ -9,6 +9,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::balance::{ACCELERATION, DRY, LATE, OFFSET, READ, SPRING, TORQUE, TORQUE_RATE, VELOCITY};
+use crate::choices::EVEN;
 use crate::gram::{
     COLUMNS, Frame, Gram, Matrix, Prior, Row, Set, UNKNOWNS, dot, log_determinant, solve, unknowns,
 };
@@ -320,8 +321,6 @@ fn information(reduced: &Matrix, precision: &Matrix, scale: f64) -> Matrix {
     out
 }
 
-const LIKELY: f64 = 0.05; // of the likeliest cause's probability: what is less is told from it
-
 impl Odds {
     fn normalise(&mut self, before: f64) {
         let each = (before / (CAUSES - 1) as f64).max(f64::MIN_POSITIVE).ln();
@@ -342,7 +341,7 @@ impl Odds {
     #[must_use]
     pub fn likely(&self, wanted: impl Fn(Cause) -> bool) -> [bool; CAUSES] {
         let Some(best) = self.best(&wanted) else { return [false; CAUSES] };
-        let least = LIKELY * self.of(best).probability;
+        let least = EVEN * self.of(best).probability;
         std::array::from_fn(|k| wanted(TABLE[k].cause) && self.of[k].probability > least)
     }
 

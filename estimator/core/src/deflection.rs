@@ -12,22 +12,12 @@
 //! turn out to be noisier than assumed: the state has taken up that noise already, so its covariance grows
 //! with the noise's.
 
+use crate::choices::{AHEAD_S, FAR, HIDDEN, MEAN_S, PEAK_S, PLAIN, SETTLED, SLOWEST, STIFF};
 use serde::{Deserialize, Serialize};
 
-const ASTRAY: f64 = 10.0; // rad, and times what is measured: no prediction of one period is so far off
 const STATES: usize = 5;
 type State = [f64; STATES];
 type Covariance = [State; STATES];
-
-const JERK_S: f64 = 1.0; // over which the mean square of φ‴ is taken
-const JERK_HOLD_S: f64 = 30.0; // how long a lively phase is remembered
-const LIVELY: f64 = 8.0; // the regression's filter hides this much of the square of φ‴
-const CORRELATION_S: f64 = 0.05; // of the third derivative and of unmodelled torques
-const SLOWEST: f64 = 0.5; // bandwidth for φ, over that of the regression's filter …
-const FASTEST: f64 = 10.0; // … and the largest one
-const UNSETTLED: f64 = 6.0; // time constants of the plain filter until a new start is forgotten
-const PLAIN: f64 = 3.0; // its bandwidth, over that of the regression's filter
-const STIFF: f64 = 0.3; // σ T²/B above which the motor's equation is not integrated any more
 
 /// See the module; fed every tick, tuned at every update.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -106,14 +96,14 @@ impl DeflectionFilter {
         let (g, h) = (1.0 - p * p * p, 1.5 * (1.0 - p) * (1.0 - p) * (1.0 + p) / period);
         let k = (1.0 - p).powi(3) / (period * period);
         let plain = [[g, h, 0.0, 0.0, 0.0], [0.0, 0.0, g, h, k]];
-        let settling = (UNSETTLED / (PLAIN * bandwidth * period)).ceil() as i64;
+        let settling = (3.0 * SETTLED / (PLAIN * bandwidth * period)).ceil() as i64;
         DeflectionFilter {
             inertia,
             damping,
             w: bandwidth,
             period,
-            average: (dt_s / JERK_S).min(1.0),
-            fade: (-dt_s / JERK_HOLD_S).exp(),
+            average: (dt_s / MEAN_S).min(1.0),
+            fade: (-dt_s / PEAK_S).exp(),
             settling,
             plain,
             gains: plain,
@@ -206,7 +196,7 @@ impl DeflectionFilter {
         };
         let ahead = [x0 + t * (x1 + 0.5 * t * a), x1 + t * a, x2 + t * (x3 + 0.5 * t * x4), x3 + t * x4, x4];
         let (e, f) = (theta - ahead[0], phi - ahead[2]);
-        if !(f.abs() < ASTRAY * (1.0 + phi.abs()) && e.is_finite()) {
+        if !(f.abs() < FAR * (1.0 + phi.abs()) && e.is_finite()) {
             self.modelled = false; // a stiffness that cannot be has made the motion model unstable
             self.restart(theta, phi);
             return;
@@ -218,7 +208,7 @@ impl DeflectionFilter {
         if plain {
             self.unsettled -= 1;
         } else {
-            self.motion.missed += t / JERK_S * (f * f / self.foreseen - self.motion.missed);
+            self.motion.missed += t / MEAN_S * (f * f / self.foreseen - self.motion.missed);
         }
     }
 
@@ -239,7 +229,7 @@ impl DeflectionFilter {
         (self.inertia, self.damping) = (tuning.inertia, tuning.damping);
         let rates = [self.x[1], self.x[1] + self.x[3]];
         let motion = &mut self.motion;
-        motion.jerk += self.average * (LIVELY * tuning.jerk * tuning.jerk - motion.jerk);
+        motion.jerk += self.average * (HIDDEN * tuning.jerk * tuning.jerk - motion.jerk);
         motion.peak = (self.fade * motion.peak).max(motion.jerk);
         for (square, rate) in motion.squares.iter_mut().zip(rates) {
             *square += self.average * (rate * rate - *square);
@@ -250,12 +240,11 @@ impl DeflectionFilter {
             return;
         }
         let density = noise * t;
-        let natural =
-            (self.motion.jerk.max(0.1 * self.motion.peak) * CORRELATION_S / density).powf(1.0 / 6.0);
-        let natural = natural.clamp(SLOWEST * w, FASTEST * w);
+        let natural = (self.motion.jerk.max(0.1 * self.motion.peak) * AHEAD_S / density).powf(1.0 / 6.0);
+        let natural = natural.clamp(SLOWEST * w, FAR * w);
         self.count_steps(tuning, natural);
         let mut c = tuning.stiffness.max(0.0) / self.inertia;
-        let mut drift = (tuning.unmodelled / self.inertia).powi(2) * CORRELATION_S;
+        let mut drift = (tuning.unmodelled / self.inertia).powi(2) * AHEAD_S;
         if !(c * t * t < STIFF && drift < noise * w.powi(4) * 1e6) {
             (c, drift) = (0.0, noise * w.powi(4));
         }

@@ -22,6 +22,7 @@ pub use paper::PaperMomentum;
 
 use serde::{Deserialize, Serialize};
 
+use crate::choices::{BLOCK_S, BLOCKS, LATEST, LINK_FLOOR, SETTLED, SLOW_S, SURE};
 use crate::effects::{Coordinates, Element};
 use crate::filters::StateVariableFilter;
 use crate::model::{Link, Model};
@@ -29,14 +30,9 @@ use crate::settings::{Priors, Settings};
 use contact::Judge;
 use link_errors::{DRY, LinkErrors};
 
-const BAND_SIGMA: f64 = 3.0; // standard deviations of what is declared: 0.3 % of joints are further off
-const SETTLED: f64 = 4.5; // delays of the filter after which a wrong start is forgotten
-const MEMORY_S: f64 = 20.0; // of how far the declared link is off, as that of the regression
-const FLOOR: f64 = 1e-3; // of the torque carried: no curve is known better
-const CONSISTENCY_S: f64 = 10.0; // over which the two flexibility torques are compared
+/// Of how far the declared link is off, as that of the regression, s.
+const MEMORY_S: f64 = BLOCKS as f64 * BLOCK_S;
 const TINY: f64 = 1e-12; // keeps a division finite
-/// Of a period: a later sample is nearer to the next one.
-pub const LATEST: f64 = 0.4;
 
 /// Bits of [`External::status`].
 pub mod status {
@@ -128,7 +124,7 @@ impl Said {
         if external.status & status::VALID != 0 {
             let now = [external.difference, external.link_torque].map(|torque| torque * torque);
             let squares = self.squares.get_or_insert(now);
-            let gain = (span_s / CONSISTENCY_S).min(1.0);
+            let gain = (span_s / SLOW_S).min(1.0);
             (0..2).for_each(|i| squares[i] += gain * (now[i] - squares[i]));
         }
         external
@@ -314,10 +310,10 @@ impl LinkMomentum {
         let around = carried.variance + read + unknown + late;
         let valid = valid && self.unsettled <= 0 && (sum + around + white).is_finite();
         let (torque, contact) = self.judge.see(sum - off, self.carried[0], around, white, valid);
-        let usual = torque.abs() <= BAND_SIGMA * (around + white).sqrt();
+        let usual = torque.abs() <= SURE * (around + white).sqrt();
         if valid && usual && !contact {
             // Errors of readings last as long as the filter does; that of the curve does not average out at all.
-            let curve = carried.variance + (FLOOR * self.judge.largest).powi(2);
+            let curve = carried.variance + (LINK_FLOOR * self.judge.largest).powi(2);
             let lasting = (read + white + late) / self.filter.bandwidth + curve * MEMORY_S;
             self.errors.identify(&row, sum - self.measured[0], lasting / self.period);
         }

@@ -12,6 +12,7 @@ pub mod align;
 pub mod balance;
 pub mod blocks;
 pub mod causes;
+pub mod choices;
 pub mod corrections;
 pub mod deflection;
 pub mod effects;

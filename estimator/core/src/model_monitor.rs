@@ -17,25 +17,21 @@ mod balance;
 
 use serde::{Deserialize, Serialize};
 
+use crate::choices::{BRIDGED, FLOOR, LIGHT, MOTION, SETTLED};
 use crate::error::Error;
 use crate::filters::StateVariableFilter;
 use crate::joint_effects::JointEffects;
 use crate::laws::Law;
+use crate::library::ABSURD;
 use crate::model::{Arrangement, Link, Model, Transmission};
 use crate::sample::{MOTORS, Sample};
+use crate::settings::Settings;
 use crate::student::t_quantile;
 
 /// Balances of a joint, at most: of its motors, then of its link.
 pub const BALANCES: usize = MOTORS + 1;
 
 const WINDOW_S: f64 = 1.0; // over which a mean square is taken: several periods of usual motions
-const NARROW_RAD_S: f64 = 60.0; // the usual bandwidth of the estimator
-const LIGHT_RATIO: f64 = 3.0; // laws that bend are formed from signals with so much more bandwidth
-const SETTLED: f64 = 30.0; // rad of the narrow filter's bandwidth until a start at rest is forgotten
-const BRIDGED: f64 = 0.4; // rad that it turns by in a gap: over a longer one the monitor begins anew
-const MOTION: f64 = 0.35; // standard deviation of x between one motion and another one
-const LEAST: f64 = 0.003; // of the torque: what filters, sampling and rounding leave of a true model
-const ABSURD: f64 = 1e9; // beyond it nothing is a measurement
 
 const TORQUE: usize = MOTORS; // channels: motor positions, motor torques, link position, external torque
 const LINK: usize = 2 * MOTORS;
@@ -158,7 +154,8 @@ impl ModelMonitor {
             .collect();
         let linked = model.link.is_some() && model.has_deflection();
         let balances = balances(model);
-        let narrow = StateVariableFilter::new(NARROW_RAD_S.min(1.0 / (LIGHT_RATIO * period_s)), period_s);
+        let bandwidth = Settings::default().bandwidth; // whatever the estimator's is: a baseline is of one filter
+        let narrow = StateVariableFilter::new(bandwidth.min(1.0 / (LIGHT * period_s)), period_s);
         let periods = |rad: f64| (rad / (narrow.bandwidth * period_s)).ceil() as u64;
         let limit = baseline.map_or([f64::INFINITY; BALANCES], |baseline| {
             let n = baseline.seconds as f64;
@@ -173,10 +170,10 @@ impl ModelMonitor {
             linked,
             pulls: if model.arrangement == Arrangement::Antagonistic { motors.len() } else { 1 },
             effects: JointEffects::new(model, period_s)?,
-            light: StateVariableFilter::new(LIGHT_RATIO * narrow.bandwidth, period_s),
+            light: StateVariableFilter::new(LIGHT * narrow.bandwidth, period_s),
             baseline,
             limit,
-            settle: periods(SETTLED),
+            settle: periods(SETTLED * (2.0 + 3.0 / LIGHT)),
             window: (WINDOW_S / period_s).round().max(1.0) as u64,
             bridged: periods(BRIDGED),
             period: period_s,
@@ -337,7 +334,7 @@ impl ModelMonitor {
         let judged = if self.measured { balances } else { self.motors.len() };
         for b in 0..balances {
             let growth = (found.torque[b] / baseline.torque[b]).max(1.0);
-            found.foreseen[b] = (baseline.residual[b] * growth).powi(2) + (LEAST * largest).powi(2);
+            found.foreseen[b] = (baseline.residual[b] * growth).powi(2) + (FLOOR * largest).powi(2);
             if b >= judged {
                 continue;
             }

@@ -1,10 +1,9 @@
 //! Encoder noise from third differences of the readings, at least the uniform rounding of a count (variance
 //! 1/12 count²).
 
+use crate::choices::{FAR, NOISE_S};
 use serde::{Deserialize, Serialize};
 
-const MEMORY_S: f64 = 2.0; // over which the noise is measured
-const OUTLIER: f64 = 100.0; // times the variance: no noise
 const THIRD: f64 = 0.05; // the third difference of white noise has 20 times its variance
 
 /// Variance of the noise of one smooth signal.
@@ -44,8 +43,8 @@ impl NoiseMeter {
             self.measured += square / self.seen.max(1.0);
             return;
         }
-        let gain = (period_s / MEMORY_S).max(1.0 / self.seen).min(1.0);
-        self.measured += gain * (square.min(OUTLIER * self.measured) - self.measured);
+        let gain = (period_s / NOISE_S).max(1.0 / self.seen).min(1.0);
+        self.measured += gain * (square.min(FAR * FAR * self.measured) - self.measured);
     }
 
     /// rad², with the resolution that has been seen (∞: none).

@@ -7,6 +7,7 @@ mod recursive;
 
 use serde::{Deserialize, Serialize};
 
+use crate::choices::{MEAN_S, TAUGHT_RAD2_S2};
 use crate::external::{External, PaperMomentum};
 use crate::filters::{first_order_pole, tustin_biquad};
 use crate::laws::{Law, PARAMETERS, powers};
@@ -18,9 +19,6 @@ use crate::settings::{Method, Priors, Settings};
 
 pub use recursive::RecursiveLeastSquares;
 
-const EXCITED_RAD2_S2: f64 = 1e-6; // mean square of φ′ above which K_R φ′² teaches anything
-const ENERGY_S: f64 = 0.5; // over which that mean is taken
-const SCATTER_S: f64 = 0.5; // over which the stiffness's mean and scatter are taken
 const SIGMA_95: f64 = 1.96; // a 95 % interval, which may not hold zero
 
 /// y = B θ′ + D θ − ∫τ, whose derivative is τ_e (from eq 5); the torque is held from sample to sample.
@@ -189,7 +187,7 @@ impl Part {
         self.q = q;
         let (phi, rate) = (q - theta, q_rate - omega);
         let slope = self.slope.update(theta, omega, tau, periods); // eq 28
-        self.energy += (span / ENERGY_S).min(1.0) * (rate * rate - self.energy);
+        self.energy += (span / MEAN_S).min(1.0) * (rate * rate - self.energy);
         if self.by_model {
             let (mut row, n) = ([0.0; PARAMETERS], self.squares.size);
             powers(phi, &mut row[..n]);
@@ -201,7 +199,7 @@ impl Part {
             let next = regressor_step(self.stiffness, slope, rate, k_r, k_max); // eqs 32, 33
             self.stiffness = if next.is_finite() { next } else { 0.0 };
         }
-        let (gain, off) = ((span / SCATTER_S).min(1.0), self.stiffness - self.mean);
+        let (gain, off) = ((span / MEAN_S).min(1.0), self.stiffness - self.mean);
         self.mean += gain * off;
         self.scatter += gain * (off * off - self.scatter);
         self.held = TransmissionEstimate {
@@ -233,7 +231,7 @@ impl Part {
     }
 
     fn observable(&self) -> bool {
-        !self.rigid && self.energy > EXCITED_RAD2_S2
+        !self.rigid && self.energy > TAUGHT_RAD2_S2
     }
 }
 

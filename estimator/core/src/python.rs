@@ -168,6 +168,10 @@ fn priors(py: Python<'_>) -> PyResult<Priors> {
         torque_offset: std("torque_offset")?,
         deflection_offset: std("declared_zero")?,
         encoder_delay: std("encoder_delay")?,
+        load_dependent_friction: std("load_dependent_friction")?,
+        undeclared: std("undeclared_effect")?,
+        law: std("declared_law")?,
+        spring: std("transmission")?,
     })
 }
 

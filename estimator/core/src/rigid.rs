@@ -1,9 +1,7 @@
 //! What the balance of a rigid joint leaves: without a transmission that deflects there is no spring to learn.
 
+use crate::choices::{SLOW_S, USUAL_S};
 use serde::{Deserialize, Serialize};
-
-const WINDOW_S: f64 = 10.0; // several periods of a slow motion
-const USUAL_S: f64 = 600.0; // a joint that stands still is judged by the torque of its last motion
 
 /// Mean and mean square, older values forgotten.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -50,7 +48,7 @@ impl RigidBalance {
         if !(left.is_finite() && torque.is_finite()) {
             return;
         }
-        self.seen_s = (self.seen_s + period_s).min(WINDOW_S);
+        self.seen_s = (self.seen_s + period_s).min(SLOW_S);
         let share = period_s / self.seen_s;
         self.left.add(left, share);
         self.torque.add(torque, share);

@@ -9,6 +9,7 @@ mod zeros;
 use serde::{Deserialize, Serialize};
 
 use crate::align::{Alignment, Inputs, Positions};
+use crate::choices::{BRIDGED, LOOK_S, SAID_S, SETTLED};
 use crate::corrections::Corrections;
 use crate::effects::MotorEffects;
 use crate::error::Error;
@@ -21,13 +22,9 @@ use crate::rigid::RigidBalance;
 use crate::sample::{Estimate, MOTORS, Sample};
 use crate::sample_validator::SampleValidator;
 use crate::settings::{Method, Priors, Settings};
-use crate::side::{Moment, SETTLE_DELAYS, Shift, Side};
+use crate::side::{Moment, Shift, Side};
 use crate::signals::{Channel, Filters};
 use crate::suspicion::Suspicion;
-
-const LOOK_S: f64 = 0.03; // between two looks at the excitation: the filters' correlation time at 60 rad/s
-const BRIDGED: f64 = 0.4; // rad that the filter turns by in a gap: a longer one is not learned from
-const SAID_S: f64 = 0.5; // how long a restart, and what was wrong with a sample, is reported
 
 /// See the module.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -103,7 +100,7 @@ impl Robust {
             flexible: model.has_deflection(),
             period: period_s,
             rate_gain: filters.rate_gain(period_s),
-            settle: (SETTLE_DELAYS * filters.delay / period_s).ceil() as i64,
+            settle: (SETTLED * filters.delay / period_s).ceil() as i64,
             filters,
             looks,
             said_periods: (SAID_S / period_s).round() as i64,

@@ -6,28 +6,14 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
+use crate::choices::{BRIEF_S, FAR, GAP_S, JUMP_RAD, NOISE_S, PATIENCE, PEAK_S, UNUSUAL, WILD_RAD_S2};
+use crate::library::ABSURD;
 use crate::model::Model;
 use crate::sample::{MOTORS, Sample, status};
 use crate::suspicion::{Reason, Signal, Suspicion};
 
 const PLACES: usize = MOTORS + 1;
 const CHANNELS: usize = 2 * MOTORS + 1;
-
-const PATIENCE: u32 = 8; // samples at a new place before a jump is believed, at least …
-const PATIENCE_S: f64 = 0.016; // … and so long
-const MARGIN: f64 = 12.0; // times the largest curvature seen lately
-const PEAK_S: f64 = 2.0; // how long a curvature is remembered
-const FLOOR_RAD: f64 = 1e-3; // no jump is smaller than this
-const COUNTS: f64 = 3.0; // counts of an encoder are no jump either
-const TORQUE_MARGIN: f64 = 10.0; // times the acceleration that the largest torque seen gives the motor
-const STILL_S: f64 = 0.02; // a channel that repeats itself for less is never frozen
-const LEARNING_S: f64 = 2.0; // after the start: how long channels usually repeat themselves
-const LONGEST_GAP_S: f64 = 0.025; // what is longer is not bridged
-const ABSURD: f64 = 1e6; // rad: no position
-const WILD_RAD_S2: f64 = 100.0; // acceleration of the bare motor below which no torque is a surprise …
-const WILD: f64 = 10.0; // … above which it is, if so many times the largest seen
-const TORQUE_S: f64 = 60.0; // how long the largest torque is remembered for that
-const REACH: f64 = 3.0; // times the largest velocity seen: how far a position may be after a gap
 
 /// What the validator made of a sample.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -131,19 +117,19 @@ impl SampleValidator {
         let lightest = model.motors.iter().map(|motor| motor.inertia).fold(f64::INFINITY, f64::min);
         let mut tame = [f64::INFINITY; MOTORS];
         model.motors.iter().zip(&mut tame).for_each(|(motor, tame)| *tame = WILD_RAD_S2 * motor.inertia);
-        let still = periods(STILL_S).max(4.0) as u32;
+        let still = periods(BRIEF_S).max(4.0) as u32;
         SampleValidator {
             motors: model.motors.len(),
             flexible: model.has_deflection(),
             period: period_s,
-            fade: (-period_s / PEAK_S).exp(),
-            fade_torque: (-period_s / TORQUE_S).exp(),
-            longest: periods(LONGEST_GAP_S).max(3.0) as i64,
-            patience: PATIENCE.max(periods(PATIENCE_S) as u32),
-            gain: TORQUE_MARGIN * period_s * period_s / lightest,
+            fade: (-period_s / NOISE_S).exp(),
+            fade_torque: (-period_s / PEAK_S).exp(),
+            longest: periods(GAP_S).max(3.0) as i64,
+            patience: PATIENCE.max(periods(BRIEF_S) as u32),
+            gain: FAR * period_s * period_s / lightest,
             tame,
             still,
-            learning: periods(LEARNING_S) as u32,
+            learning: periods(NOISE_S) as u32,
             found: None,
             trail: vec![[f64::NAN; PLACES]; still as usize + 1].into(),
             memory: FRESH,
@@ -272,7 +258,7 @@ impl SampleValidator {
                 self.found = Some((Signal::MotorTorque(i), Reason::Impossible));
                 return true;
             }
-            if size >= self.tame[i].max(WILD * m.largest[i]) {
+            if size >= self.tame[i].max(FAR * m.largest[i]) {
                 m.wild += 1;
                 if m.wild < self.patience || size > ABSURD * self.tame[i] {
                     self.found = Some((Signal::MotorTorque(i), Reason::Jumped));
@@ -291,11 +277,11 @@ impl SampleValidator {
         let m = &mut self.memory;
         m.torque *= self.fade;
         m.largest = m.largest.map(|size| self.fade_torque * size);
-        let floor = FLOOR_RAD.max(self.gain * m.torque);
+        let floor = JUMP_RAD.max(self.gain * m.torque);
         for i in 0..PLACES {
             m.peaks[i] *= self.fade;
-            let step = if m.steps[i].is_finite() { COUNTS * m.steps[i] } else { f64::INFINITY };
-            m.limits[i] = floor.max(MARGIN * m.peaks[i]).max(step);
+            let step = if m.steps[i].is_finite() { UNUSUAL * m.steps[i] } else { f64::INFINITY };
+            m.limits[i] = floor.max(FAR * m.peaks[i]).max(step);
         }
     }
 
@@ -307,7 +293,7 @@ impl SampleValidator {
         if m.samples > self.learning {
             for i in 0..self.motors + usize::from(self.flexible) {
                 let off = places[i] - m.places[i];
-                if off.abs() > FLOOR_RAD + REACH * m.fastest[i] * periods as f64 {
+                if off.abs() > JUMP_RAD + UNUSUAL * m.fastest[i] * periods as f64 {
                     jumps[i] = off;
                 }
             }

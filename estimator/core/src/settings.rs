@@ -101,6 +101,14 @@ pub struct Priors {
     pub deflection_offset: f64,
     /// Of the link encoder's delay, periods.
     pub encoder_delay: f64,
+    /// Of the share of the torque that a gear loses.
+    pub load_dependent_friction: f64,
+    /// Of any other effect that nobody declared, as a share of the torque.
+    pub undeclared: f64,
+    /// Of a law's parameter that is declared without its own, relative to it.
+    pub law: f64,
+    /// Of a spring's torque where nothing is declared, as a share of the motor's.
+    pub spring: f64,
 }
 
 #[cfg(test)]
@@ -114,5 +122,9 @@ impl Priors {
         torque_offset: 0.3,
         deflection_offset: 0.003,
         encoder_delay: 1.0,
+        load_dependent_friction: 0.25,
+        undeclared: 0.05,
+        law: 0.3,
+        spring: 10.0,
     };
 }

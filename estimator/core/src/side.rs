@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::align::Inputs;
 use crate::balance::{Balance, correlated_rows};
 use crate::blocks::{Blocks, Closed};
+use crate::choices::{AHEAD_S, GROWN, REACHED, SAID_S, SETTLED, SURE};
 use crate::deflection::{AT_REST, DeflectionFilter, Motion, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
 use crate::model::Motor;
@@ -14,15 +15,6 @@ use crate::settings::Priors;
 use crate::signals::{Channel, Excitation, Filters};
 use crate::spring::Family;
 use crate::unknowns::{DAMPING, INERTIA};
-
-/// Filter delays after which a wrong start is forgotten.
-pub const SETTLE_DELAYS: f64 = 4.5;
-const BEYOND: f64 = 1.5; // times the largest deflection: no more is known of the curve
-const EDGE: f64 = 0.98; // of where a law ends
-const HALF: f64 = 0.5; // periods: what is later is shifted, the rest is a column
-const SURE: f64 = 3.0; // standard deviations of a delay that is shifted
-const CONFIRMED_S: f64 = 0.05; // of rows that agree with what is known before a moved zero is believed
-const FOLLOWED_S: f64 = 0.5; // how long it is said that a change has been followed
 
 /// What a period brings to every motor.
 #[derive(Clone, Copy, Debug)]
@@ -95,7 +87,7 @@ impl Side {
         alarms_per_hour: f64,
     ) -> Side {
         let rows = correlated_rows(&filters.main, period_s);
-        let settle = (SETTLE_DELAYS * filters.delay / period_s).ceil() as u32;
+        let settle = (SETTLED * filters.delay / period_s).ceil() as u32;
         let blocks = Blocks::new(motor, priors, period_s, rows, settle, alarms_per_hour);
         let family = Family::of(Some(&blocks.spring.law));
         let mut made = Side {
@@ -168,7 +160,7 @@ impl Side {
 
     /// An encoder has moved its zero, `known`: by so much, or somewhere.
     pub fn move_zero(&mut self, known: bool) {
-        self.unconfirmed_s = CONFIRMED_S;
+        self.unconfirmed_s = AHEAD_S;
         if known {
             self.blocks.cut();
         } else {
@@ -215,7 +207,7 @@ impl Side {
     #[must_use]
     pub fn is_within(&self, phi: f64) -> bool {
         let largest = self.balance.largest();
-        largest == 0.0 || phi.abs() <= BEYOND * largest
+        largest == 0.0 || phi.abs() <= GROWN * largest
     }
 
     /// One period of all channels of motor `i`.
@@ -224,7 +216,7 @@ impl Side {
         let (theta, phi, torque) = (now.at.motor[i], now.at.deflection(i), now.torque[i]);
         let few = self.blocks.are_few();
         // No spring is deflected beyond where its law ends.
-        let can_be = few || !self.doubtful && phi.abs() < EDGE * self.blocks.spring.reach();
+        let can_be = few || !self.doubtful && phi.abs() < REACHED * self.blocks.spring.reach();
         if !self.rigid && can_be && self.balance.outgrown(phi) {
             let factors = self.balance.grow(phi);
             self.blocks.grow(&factors, &self.balance);
@@ -313,7 +305,7 @@ impl Side {
         let doubted = self.doubtful;
         self.judge();
         match closed {
-            Closed::Begun => self.followed_s = FOLLOWED_S,
+            Closed::Begun => self.followed_s = SAID_S,
             Closed::Added if doubted => self.deflection.recall(self.usual), // what was read since may be no motion
             Closed::Added => self.usual = self.deflection.motion(),
             Closed::Unexplained => {}
@@ -326,7 +318,7 @@ impl Side {
         let known = !self.doubtful && !self.blocks.is_lost(); // a zero that is elsewhere looks late
         let (late, std) = self.blocks.delay().filter(|_| known)?;
         let (periods, std) = (late / self.period, std / self.period);
-        let late = periods.abs() > HALF && periods.abs() - HALF > SURE * std;
+        let late = periods.abs() - 0.5 > SURE * std;
         late.then(|| Shift::Late(periods.round()))
     }
 

@@ -2,9 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::choices::{CLEAR, LIGHT, MEAN_S, PEAK_S, SLOW};
 use crate::filters::StateVariableFilter;
-
-const LIGHT_RATIO: f64 = 5.0; // bandwidth of the light filter over that of the main one
 
 /// The two filters that every channel passes, F G.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
@@ -22,7 +21,7 @@ impl Filters {
     #[must_use]
     pub fn new(bandwidth_rad_s: f64, period_s: f64) -> Filters {
         let main = StateVariableFilter::<4>::new(bandwidth_rad_s.min(0.25 / period_s), period_s);
-        let light = StateVariableFilter::<3>::new(LIGHT_RATIO * main.bandwidth, period_s);
+        let light = StateVariableFilter::<3>::new(LIGHT * main.bandwidth, period_s);
         Filters { light, main, delay: 3.0 / light.bandwidth + 4.0 / main.bandwidth }
     }
 
@@ -109,11 +108,6 @@ pub struct Excitation {
 }
 
 impl Excitation {
-    const WINDOW_S: f64 = 0.3; // over which the rate's mean square is taken
-    const NOISE_MARGIN: f64 = 5.0; // so much above its noise a rate is motion
-    const SHARE: f64 = 0.02; // of the largest rate seen: what is slower teaches next to nothing
-    const PEAK_S: f64 = 60.0; // how long the largest rate is remembered
-
     /// Whether a filtered rate of φ is above the noise that it has, over the last moments.
     ///
     /// `usual`: whether the balance was explained at the last update; what was read otherwise is no measure.
@@ -122,7 +116,7 @@ impl Excitation {
             self.square = 0.0;
             return false;
         }
-        let fade = (-dt / Self::PEAK_S).exp();
+        let fade = (-dt / PEAK_S).exp();
         let [rms_before, noise_before] = std::mem::take(&mut self.before);
         if usual {
             self.peak = (fade * self.peak).max(rms_before);
@@ -130,10 +124,10 @@ impl Excitation {
         } else {
             self.square = self.square.min(self.peak * self.peak);
         }
-        self.square += (dt / Self::WINDOW_S).min(1.0) * (rate * rate - self.square);
+        self.square += (dt / MEAN_S).min(1.0) * (rate * rate - self.square);
         let rms = self.square.sqrt();
         self.before = [rms, noise];
-        rms > Self::NOISE_MARGIN * self.noise.max(noise) && rms > Self::SHARE * self.peak && rms > 0.0
+        rms > CLEAR * self.noise.max(noise) && rms > SLOW * self.peak && rms > 0.0
     }
 }
 

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use std::sync::Arc;
 
+use crate::choices::MARGIN;
 use crate::laws::{Law, Table};
 
 /// Functions of a family.
@@ -17,8 +18,6 @@ pub const TERMS: usize = 5;
 pub type Coefficients = [f64; 2 * TERMS];
 
 pub(crate) const NODES: usize = 41; // of the least squares: four for each function
-/// Times the size: a motion grows a little before it is scaled anew.
-pub(crate) const MARGIN: f64 = 1.1;
 const RIDGE: f64 = 1e-12; // of the diagonal: two functions may be one
 
 /// The functions that a curve is a sum of.

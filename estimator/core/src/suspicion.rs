@@ -3,10 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use crate::causes::{Cause, Odds, TABLE};
+use crate::choices::{ACCUSED, UNUSUAL};
 use crate::sample::MOTORS;
-
-const EXPLAINED: f64 = -20.0; // ln of the odds of a change where a balance is explained
-const EXPLAINS: f64 = 2.0; // times the usual mean square that a cause may leave
 
 /// A signal of a joint; motors are counted from 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -75,7 +73,7 @@ impl Suspicion {
         let log = |motor: usize, cause: Cause| match odds[motor] {
             Some(odds) => odds.log[cause as usize],
             None if cause == Cause::Nothing => 0.0,
-            None => EXPLAINED,
+            None => -2.0 * ACCUSED.ln(), // explained
         };
         let mut best: Option<(f64, usize, Cause)> = None;
         for motor in (0..motors).filter(|motor| odds[*motor].is_some()) {
@@ -110,7 +108,7 @@ impl Suspicion {
             reason,
             amount: found.amplitude,
             std: found.std,
-            explains: found.misfit < EXPLAINS,
+            explains: found.misfit < UNUSUAL,
         })
     }
 }

@@ -42,9 +42,6 @@ pub const CLIPS: std::ops::Range<usize> = 19..23;
 /// Those that every joint has.
 pub const ACTIVE: Set = (1 << SOFT) - 2;
 
-const UNDECLARED: f64 = 0.05; // amplitude of an effect that nobody declared, as a share of the torque
-const SPRING_SHARE: f64 = 10.0; // of the flexibility torque, as a share of the motor's: the data decide
-const DECLARED: f64 = 0.3; // relative standard deviation of a law's parameter that is declared without one
 const SHAPES: usize = 12; // of a law that are tried before any is known
 const NARROWEST: f64 = 0.05; // of them: the bend that a shape makes over the deflection seen …
 const WIDEST: f64 = 6.0; // … and the largest
@@ -331,7 +328,8 @@ impl Spring {
         };
         let (mut mean, mut std) = ([0.0; UNKNOWNS], [1.0; UNKNOWNS]);
         for unknown in SOFT..UNKNOWNS {
-            let share = if LOAD.contains(&unknown) { 0.25 } else { UNDECLARED };
+            let gear = LOAD.contains(&unknown);
+            let share = if gear { priors.load_dependent_friction } else { priors.undeclared };
             std[unknown] = share * torque / rms(unknown);
         }
         let inertia = motor.inertia_std.unwrap_or(priors.motor_inertia);
@@ -347,10 +345,10 @@ impl Spring {
         for (i, unknown) in SPRING.enumerate().take(self.size) {
             mean[unknown] = if self.anchored { self.start[i] - base[i] } else { 0.0 };
             std[unknown] = match (self.anchored, i.checked_sub(1).and_then(|k| shapes.get(k))) {
-                (true, Some(shape)) => DECLARED * (self.start[i] - shape.low),
-                (true, None) if self.start[i] != 0.0 => DECLARED * self.start[i].abs(),
+                (true, Some(shape)) => priors.law * (self.start[i] - shape.low),
+                (true, None) if self.start[i] != 0.0 => priors.law * self.start[i].abs(),
                 (false, Some(shape)) => (2.0 * (self.alpha[i] - shape.low)).max(1.0 / deflection),
-                _ => SPRING_SHARE * torque / fluctuation(unknown), // its mean may be a zero that is elsewhere
+                _ => priors.spring * torque / fluctuation(unknown), // its mean may be a zero that is elsewhere
             };
         }
         (mean[ZERO], std[ZERO]) = (-self.zero, zero_std);

@@ -110,6 +110,10 @@ fn priors() -> Priors {
         torque_offset: 0.02,
         deflection_offset: 0.05,
         encoder_delay: 1.0,
+        load_dependent_friction: 0.25,
+        undeclared: 0.05,
+        law: 0.3,
+        spring: 10.0,
     }
 }
 

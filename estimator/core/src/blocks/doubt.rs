@@ -1,14 +1,12 @@
 //! Blocks that what is known does not explain: has the joint changed, or a reading, or the zero?
 
-use super::{BLOCKS, Blocks, CONVINCING, Carried, Closed, EXPLAINED, FEWEST, WINDOW};
+use super::{Blocks, Carried, Closed};
 use crate::balance;
 use crate::causes::{Cause, Known, Noise, Odds, TABLE};
+use crate::choices::{BLOCKS, CONVINCING, EVEN, FEWEST, REST, UNUSUAL};
 use crate::gram::{Gram, Set, UNKNOWNS, inverse, set};
 use crate::spring::TERMS;
 use crate::unknowns::{DAMPING, INERTIA, SPRING, ZERO};
-
-const REST: f64 = 0.03; // of what is left without it: an effect that bends with the change
-const DECIDED: f64 = 0.95; // probability at which a change of the joint itself is followed
 
 impl Blocks {
     /// Something has changed: rows are of use again when the filters have forgotten what was before.
@@ -38,11 +36,11 @@ impl Blocks {
 
     /// What the causes say of the last blocks together, each of which was explained: a change may be slow.
     pub(super) fn judge_latest(&self) -> Option<Odds> {
-        if self.ring.len() < 2 * WINDOW {
+        if self.ring.len() < 2 * FEWEST {
             return None;
         }
         let mut window = Gram::default();
-        (0..WINDOW).for_each(|k| window.add(&self.ring[self.place(k)], 1.0));
+        (0..FEWEST).for_each(|k| window.add(&self.ring[self.place(k)], 1.0));
         self.odds_of(&window)
     }
 
@@ -53,7 +51,7 @@ impl Blocks {
         self.ring.rotate_left(self.oldest);
         self.peaks.rotate_left(self.oldest);
         self.oldest = 0;
-        let kept = self.ring.len() - WINDOW;
+        let kept = self.ring.len() - FEWEST;
         self.waiting.extend(self.ring.drain(kept..));
         self.peaks.truncate(kept);
         self.solve();
@@ -95,13 +93,13 @@ impl Blocks {
         let bends =
             best.is_some_and(|cause| matches!(cause, Cause::Stiffness | Cause::Shape | Cause::Friction));
         let rest = if bends { REST * odds.of(Cause::Nothing).misfit } else { 0.0 };
-        let most = EXPLAINED.max(rest);
+        let most = UNUSUAL.max(rest);
         let explained = best.is_some_and(|cause| odds.of(cause).misfit < most);
         self.odds = Some(odds);
         if self.spoilt {
             self.waiting.clear(); // samples that could not be used were among them: no joint is like that
         }
-        if self.waiting.len() >= 2 && of_joint > DECIDED && explained && !self.is_unconfirmed() {
+        if self.waiting.len() >= 2 && of_joint > 1.0 - EVEN && explained && !self.is_unconfirmed() {
             // All that the window does not tell apart is open.
             let likely = odds.likely(|cause| cause.entry().opens != 0);
             let opens = TABLE.iter().zip(likely).filter(|(_, likely)| *likely).map(|(entry, _)| entry.opens);
@@ -117,7 +115,7 @@ impl Blocks {
             self.begin(set(1..UNKNOWNS));
             return Closed::Begun;
         }
-        if self.waiting.len() >= WINDOW {
+        if self.waiting.len() >= FEWEST {
             self.waiting.remove(0);
         }
         Closed::Unexplained

@@ -1,11 +1,10 @@
 //! What the blocks have taught.
 
-use super::{BLOCKS, Blocks, EXPLAINED};
+use super::Blocks;
 use crate::balance::Balance;
+use crate::choices::{BLOCKS, UNUSUAL, USEFUL};
 use crate::gram::{UNKNOWNS, set};
 use crate::unknowns::{CANDIDATES, LATE, OFFSET, RATE, Reading};
-
-const USEFUL: f64 = 0.2; // share of the torque that a curve may leave unexplained
 
 impl Blocks {
     /// Delay of the link position, s, and its standard deviation.
@@ -60,7 +59,7 @@ impl Blocks {
     #[must_use]
     pub fn is_explained(&self) -> bool {
         let usual = self.usual_unexplained().max((self.white / self.fluctuation).sqrt());
-        self.unexplained < USEFUL && self.unexplained <= EXPLAINED.sqrt() * usual
+        self.unexplained < USEFUL && self.unexplained <= UNUSUAL.sqrt() * usual
     }
 
     /// rms of what the balance has left over the last moments, N·m.

@@ -1,25 +1,20 @@
 //! The unknowns of one motor's balance from the sum of its blocks: prior, noise, choice, interval.
 
-use super::{Blocks, FEWEST, REACHED};
+use super::Blocks;
 use crate::balance;
+use crate::choices::{ACCUSED, ALIKE, EVEN, EXACT, FEWEST, MARGIN, REACHED, SURE, UNLIKE};
 use crate::gram::{
     COLUMNS, Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, by_prior, choose, cluster, dot,
     log_evidence, set, solve, unknowns,
 };
 use crate::laws::{Law, PARAMETERS};
-use crate::spring::{MARGIN, Projection};
+use crate::spring::Projection;
 use crate::student::t_95;
 use crate::unknowns::{ACTIVE, CANDIDATES, DRY, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO};
 
 const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
 const WIDE: f64 = 1e6; // of a prior that says nothing
-const SURE: f64 = 3.0; // standard deviations of a compliance that is one
 const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
-const EXACT: f64 = 3e-4; // of the torque: what filters, sampling and rounding leave of a true model
-const ALIKE: f64 = 0.3; // share of what a missing effect does to a block that it does to all: 0 is noise, 1 one motion again and again
-const UNLIKE: f64 = 0.05; // of friction and memory that nobody declared: no joint's are quite of our shapes
-const UNLIKELY: f64 = 0.05; // probability that an interval of 95 % need not hold
-const ACCUSED: f64 = 1000.0; // odds at which the declared zero is called wrong
 
 type Groups = [Set; CANDIDATES.len() + SPRING.end - SPRING.start];
 
@@ -308,7 +303,7 @@ impl Blocks {
         for (set, prior) in rivals {
             let odds = (log_evidence(reduced, set, prior, noise) - chosen.log_evidence).exp() / many;
             let probability = odds / (1.0 + odds);
-            if probability < UNLIKELY {
+            if probability < EVEN {
                 continue;
             }
             let Some(other) = solve(reduced, set, prior, noise) else { continue };

@@ -2,18 +2,16 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{BAND_SIGMA, TINY};
+use super::TINY;
+use crate::choices::{BRIEF_S, CAP, SURE, TOUCH};
 use crate::settings::Settings;
 
-const SHARE: f64 = 0.05; // of the torque carried: the least contact, where none is declared; what bearings take
-const FIND_S: f64 = 0.02; // in which the test is to find the smallest push it can
 const UNCORRELATED: f64 = 0.697; // w t from which on the noise of s² w³/(s + w)³ is not positively correlated
 const OVERSHOOT: f64 = 1.166; // of a sum over its threshold, standard deviations (Siegmund 1985, chapter X)
-const CAP: f64 = 2.0; // thresholds that a sum may reach: a long contact ends as soon as a short one
 
 /// A two-sided CUSUM of what is beyond a band.
 ///
-/// Its reference value is the one with which the smallest push is found in [`FIND_S`], its threshold follows
+/// Its reference value is the one with which the smallest push is found in [`BRIEF_S`], its threshold follows
 /// from the rate of false alarms by Siegmund's approximation of the average run length. Torques are looked
 /// at so far apart that their noise is not positively correlated, so the rate is an upper bound.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -34,7 +32,7 @@ impl ContactTest {
         let dt = every * period_s;
         // Two one-sided tests, each with half of the false alarms.
         let run = (2.0 * 3600.0 / (false_alarms_per_hour * dt)).max(2.0);
-        let looks = (FIND_S / dt).round().max(1.0);
+        let looks = (BRIEF_S / dt).round().max(1.0);
         let (mut best, mut reference, mut threshold) = (f64::INFINITY, 0.0, 0.0);
         for step in 1..=80 {
             let k = 0.05 * f64::from(step);
@@ -122,8 +120,8 @@ impl Judge {
             return (sum - self.bias, false); // a contact that lasts is one still when it is valid again
         }
         self.bias += self.follow * (sum - self.bias);
-        let least = self.least.unwrap_or(SHARE * self.largest);
-        let band = least.max(BAND_SIGMA * uncertain.sqrt());
+        let least = self.least.unwrap_or(TOUCH * self.largest);
+        let band = least.max(SURE * uncertain.sqrt());
         let contact = self.test.see(sum - self.bias, band, noise.sqrt());
         if !contact {
             self.largest = self.largest.max(carried.abs());

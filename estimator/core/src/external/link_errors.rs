@@ -3,10 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::{MEMORY_S, TINY};
+use crate::choices::{ONE_WAY, SLOW};
 use crate::model::Link;
 
-const FRICTION_SPEEDS: f64 = 0.02; // of the largest velocity: over which dry friction changes its sign
-const ONE_WAY: f64 = 0.9; // mean direction beyond which less than a twentieth of the motion goes the other way
 const PARAMETERS: usize = 6;
 const CONSTANT: usize = 0;
 const DAMPING: usize = 2;
@@ -37,7 +36,7 @@ impl LinkErrors {
     /// What the parameters multiply.
     pub(super) fn row(&mut self, link: &Link, [q, velocity, acceleration]: [f64; 3]) -> Row {
         self.fastest = self.fastest.max(velocity.abs());
-        let dry = (velocity / (FRICTION_SPEEDS * self.fastest).max(TINY)).tanh();
+        let dry = (velocity / (SLOW * self.fastest).max(TINY)).tanh();
         let (sine, cosine) = (q + link.gravity_phase).sin_cos();
         [1.0, acceleration, velocity, dry, sine, cosine]
     }

@@ -1,13 +1,12 @@
 //! What is said of the joint at a sample.
 
 use super::Robust;
+use crate::choices::BRIEF_S;
 use crate::deflection::Present;
 use crate::reasons::{Reason, Why};
 use crate::sample::{Estimate, MOTORS, TransmissionEstimate, joint_estimate, status};
 use crate::side::Side;
 use crate::suspicion;
-
-const TRUST_S: f64 = 0.02; // how long an estimate is carried over rejected samples
 
 impl Robust {
     pub(super) fn conclude(&mut self, sequence: u64, flags: u32) -> Estimate {
@@ -64,7 +63,7 @@ impl Robust {
         };
         let mut flags = flags | last.status & (status::CHANGED | status::RESTARTED);
         let was = |bit: u32| last.status & bit != 0;
-        if since > TRUST_S {
+        if since > BRIEF_S {
             self.why = rejected;
             return Estimate { sequence, status: flags, ..last };
         }

@@ -2,11 +2,9 @@
 
 use super::Robust;
 use crate::align::Positions;
+use crate::choices::{AHEAD_S, NEAR};
 use crate::external::LinkMomentum;
 use crate::sample::MOTORS;
-
-const HOME: f64 = 0.01; // of a jump: a zero that comes back so near to the first one is that one
-const FORESEEN_S: f64 = 0.04; // how far ahead a deflection is extrapolated
 
 impl Robust {
     /// The link is later than was assumed: what was learned is of other moments.
@@ -71,7 +69,7 @@ impl Robust {
         let now = at.from_zeros(&self.zeros);
         for i in 0..m {
             let side = &self.sides[i];
-            if ahead > FORESEEN_S || side.rigid || side.deflection.unsettled > 0 {
+            if ahead > AHEAD_S || side.rigid || side.deflection.unsettled > 0 {
                 continue;
             }
             let off = now.deflection(i) - side.deflection.at(ahead);
@@ -84,7 +82,7 @@ impl Robust {
         let moved = |zero: f64, jump: f64| {
             // One that jumps back has come home exactly.
             let moved = zero + jump;
-            if moved.abs() < HOME * jump.abs() { 0.0 } else { moved }
+            if moved.abs() < NEAR * jump.abs() { 0.0 } else { moved }
         };
         for i in 0..m {
             self.zeros.motor[i] = moved(self.zeros.motor[i], jumps[i]);
@@ -94,7 +92,7 @@ impl Robust {
         }
         let now = at.from_zeros(&self.zeros);
         for (i, side) in self.sides.iter_mut().enumerate() {
-            let known = ahead <= FORESEEN_S && side.is_within(now.deflection(i));
+            let known = ahead <= AHEAD_S && side.is_within(now.deflection(i));
             if !known {
                 self.zeros.motor[i] = at.motor[i] - now.link; // in the middle of where it can be
             }

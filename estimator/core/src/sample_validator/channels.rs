@@ -2,15 +2,14 @@
 
 use std::collections::VecDeque;
 
-use super::{CHANNELS, MARGIN, PLACES, SampleValidator};
+use super::{CHANNELS, PLACES, SampleValidator};
+use crate::choices::{FAR, PATIENCE};
 use crate::sample::MOTORS;
 use crate::suspicion::{Reason, Signal};
 
-const STOPPED_COUNTS: f64 = 10.0; // … nor is a position that was slower than so many counts in that time …
 /// … or that slowed down: of the way of that time, a motor that friction brings to rest goes 1/16 in the last quarter, a
 /// reading that freezes in motion 1/4.
 const ABRUPT: f64 = 1.0 / 8.0;
-const FIRST: u32 = 8; // samples after a start that are not judged
 const ROUNDING: f64 = 1e-12; // of a position: what arithmetic may leave of counts that cancel
 
 impl SampleValidator {
@@ -62,7 +61,7 @@ impl SampleValidator {
     pub(super) fn jumped(&mut self, places: &[f64; PLACES], periods: f64) -> bool {
         let watched = self.watched();
         let m = &mut self.memory;
-        let checked = m.seen >= FIRST || (m.seen >= 2 && m.samples > self.learning);
+        let checked = m.seen >= PATIENCE || (m.seen >= 2 && m.samples > self.learning);
         if m.rejected == 0 {
             m.astray = [false; PLACES];
         }
@@ -92,7 +91,7 @@ impl SampleValidator {
             if bend > m.peaks[i] && m.seen > 0 {
                 // The first two samples make the first slope.
                 m.peaks[i] = bend;
-                m.limits[i] = m.limits[i].max(MARGIN * bend);
+                m.limits[i] = m.limits[i].max(FAR * bend);
             }
         }
         if !jumped {
@@ -107,5 +106,5 @@ fn stops_dead(trail: &VecDeque<[f64; PLACES]>, place: usize, count: f64) -> bool
     let last = trail.len() - 1;
     let way = |periods: usize| (trail[last][place] - trail[last - periods][place]).abs();
     let all = way(last);
-    all > STOPPED_COUNTS * count && way(last / 4) - count > ABRUPT * all
+    all > FAR * count && way(last / 4) - count > ABRUPT * all
 }

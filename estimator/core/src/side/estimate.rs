@@ -1,7 +1,8 @@
 //! What one motor says of its transmission at this moment.
 
-use super::{BEYOND, EDGE, Side};
+use super::Side;
 use crate::causes::{CAUSES, Cause};
+use crate::choices::{DRIFT, DRIFTED, GROWN, REACHED};
 use crate::deflection::Present;
 use crate::external::Carried;
 use crate::gram::Vector;
@@ -9,9 +10,6 @@ use crate::laws::Law;
 use crate::reasons::Reason;
 use crate::sample::TransmissionEstimate;
 use crate::unknowns::{DRY, SPRING};
-
-const WIDEST: f64 = 0.02; // … up to this
-const DRIFT: f64 = 1e-4; // relative growth of the standard deviation per second without motion …
 
 impl Side {
     /// The estimate at the present deflection; `delay`: of the filters.
@@ -28,7 +26,7 @@ impl Side {
         };
         let more = self.effects.spring(phi);
         let stiffness = at.stiffness + more.1;
-        let held = (DRIFT * self.held_s).min(WIDEST);
+        let held = (DRIFT * self.held_s).min(DRIFTED);
         // A curve is as uncertain as its parameters, and as φ is where it bends.
         let std = |by: &Vector, slope: f64, value: f64| {
             let variance = self.blocks.posterior.as_ref().map_or(f64::NAN, |known| known.variance_along(by));
@@ -91,7 +89,7 @@ impl Side {
         if !self.fits {
             return Some(Reason::Unexplained(self.unexplained));
         }
-        let reach = (BEYOND * self.balance.largest()).min(EDGE * self.blocks.spring.reach());
+        let reach = (GROWN * self.balance.largest()).min(REACHED * self.blocks.spring.reach());
         let phi = part.deflection - self.blocks.spring.zero;
         let within = phi.abs() < if reach > 0.0 { reach } else { f64::INFINITY };
         (!within).then_some(Reason::Beyond)

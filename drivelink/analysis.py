@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from drivelink.jointfile import JointText, apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import as_read, diagnosed_model, floor_entry
 from drivelink.output import fitreport, plots, report, sentences
 from drivelink.output import motion as motions
-from drivelink.output.comparison import beside
+from drivelink.output.comparison import beside, fits, fits_json, simulated
 from drivelink.output.document import Section, write
 from drivelink.output.numbers import Units
 from drivelink.recording.columns import parse_column_map
@@ -66,9 +67,14 @@ class Runs:
     names: tuple[str, ...] = ()  # columns of others under our names
 
     @property
+    def names_of_files(self) -> list[str]:
+        """The names of the files, without their folders."""
+        return [path.name for path in self.paths]
+
+    @property
     def named(self) -> str:
-        """The names of the files, in one line."""
-        return ", ".join(path.name for path in self.paths)
+        """The same in one line."""
+        return ", ".join(self.names_of_files)
 
     @property
     def units(self) -> Units:
@@ -76,7 +82,7 @@ class Runs:
         return Units(self.source.joint.axis == "linear")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Fit:
     """A joint, fitted to recordings.
 
@@ -178,12 +184,21 @@ class Fit:
                     f"deflections of the recording; that of motor {number} is not"
                 )
 
+    @cached_property
+    def free_runs(self) -> list[dict[str, FreeRun]]:
+        """The fitted model under the motor torque of each recording; empty where it cannot be simulated."""
+        return [simulated(record, fitted=self.found.model) for record in self.runs.records]
+
     def as_json(self) -> dict[str, Any]:
         """Return the content of fit.json."""
-        return fitreport.as_json(self.found, [path.name for path in self.runs.paths], self.runs.notes)
+        return fitreport.as_json(self.found, self.runs.names_of_files, self.free_runs, self.runs.notes)
+
+    def sections(self) -> list[Section]:
+        """Return what was fitted, as tables."""
+        return fitreport.sections(self.found, self.runs.names_of_files, self.free_runs, self.runs.units)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Diagnosed:
     """What a joint's model lacks."""
 
@@ -201,14 +216,33 @@ class Diagnosed:
         """The outcome with the gate's notes, as the reports have it."""
         return replace(self.outcome, notes=(*self.runs.notes, *self.outcome.notes))
 
+    @property
+    def judged(self) -> tuple[str, Record]:
+        """The recording that free runs are of, with its name: the held-out one, else the first."""
+        if self.held is not None:
+            return str(self.validated), self.held
+        return self.runs.paths[0].name, self.runs.records[0]
+
+    @property
+    def models(self) -> tuple[JointModel, JointModel]:
+        """The joint as declared, and with what was found."""
+        joint = self.runs.source.joint
+        return joint.model(), diagnosed_model(joint, self.outcome)
+
+    @cached_property
+    def free_runs(self) -> dict[str, FreeRun]:
+        """Both under the measured motor torque, as "declared" and "found", where they can be simulated."""
+        declared, found = self.models
+        return simulated(self.judged[1], declared=declared, found=found)
+
     def as_json(self) -> dict[str, Any]:
         """Return the content of report.json."""
-        document = report.as_json(self.documented)
+        document = report.as_json(self.documented) | {"free_run": fits_json(self.free_runs, self.judged[0])}
         return document if self.motion is None else document | {"motion": motions.as_json(self.motion)}
 
     def sections(self) -> list[Section]:
         """Return what the report describes and draws."""
-        made = report.sections(self.documented, self.runs.units)
+        made = [*report.sections(self.documented, self.runs.units), fits(self.free_runs, self.judged[0])]
         return made if self.motion is None else [*made, motions.section(self.motion, self.runs.units)]
 
     def report(self, folder: str | Path) -> list[Path]:
@@ -216,9 +250,8 @@ class Diagnosed:
         joint, out = self.runs.source.joint, Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         title = report.Title(joint.name, self.runs.named, self.validated, joint.axis == "linear")
-        written = diagnosed_model(joint, self.outcome)
-        record = self.runs.records[0] if self.held is None else self.held
-        made = beside(self.runs.named, joint.model(), written, record, self.runs.units)
+        name, record = self.judged
+        made = beside(name, self.models, self.free_runs, record, self.runs.units)
         more = [*([] if self.motion is None else [motions.section(self.motion, self.runs.units)]), *made]
         return write(out, "report", self.as_json(), report.html_page(self.documented, title, more))
 

@@ -105,6 +105,9 @@ CHOICES: dict[str, Choice] = {
     "unseen": Choice(
         0.25, "recording", "held out to see what a written model does", "most of it is to make the model"
     ),
+    "horizon": Choice(
+        1.0, "s", "of a free run that judges a model", "without position control a longer one drifts"
+    ),
     "one_sine": Choice(
         1.08, "spectral lines", "of a motion that separates nothing", "one, and what its window leaks"
     ),

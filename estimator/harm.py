@@ -1,8 +1,9 @@
 """Whether a model that is to be written does harm: it and the declared one over data that it was not made of.
 
-Compared are the balance of the model as it stands, and what the estimator does with it from tick to tick: how
-often it is valid, the external torque against a sensor, and, where the declared model has no balance yet,
-what is left of the torque. Worse is what is worse by more than its standard error over the blocks and `harm`.
+Compared are the balance of the model as it stands, its free run, which also judges motions in which torques
+cancel, and what the estimator does with it from tick to tick: how often it is valid, the external torque
+against a sensor, and, where the declared model has no balance yet, what is left of the torque. Worse is what
+is worse by more than its standard error over the blocks and `harm`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from estimator.choices import choice, whole
 from estimator.errors import EstimatorError
+from estimator.freerun import free_run
 from estimator.model import JointModel
 from estimator.model_monitor import can_monitor, seconds_of
 from estimator.online import make_estimator
@@ -23,6 +25,9 @@ from estimator.settings import EstimatorSettings
 from estimator.transmissions import transmission_model
 
 __all__ = ["Unseen", "harm", "harm_of_parts"]
+
+
+_NOTHING = 1e-12  # rad: keeps a channel that stands still finite
 
 
 class Unseen(NamedTuple):
@@ -87,6 +92,7 @@ def harm(
     return (
         _unexplained(written, unseen)
         or _balance(declared, written, unseen)
+        or _free_run(declared, written, unseen)
         or _on_line(declared, written, unseen, settings or EstimatorSettings())
     )
 
@@ -156,6 +162,29 @@ def _balance(declared: JointModel, written: JointModel, unseen: Sequence[Unseen]
     after, rms = figure.rms
     whose = "the declared one" if known else "no model"
     return f"on held-out data the new model leaves {after:.3g} N·m of the torque, {whose} {rms:.3g}"
+
+
+def _free_run(declared: JointModel, written: JointModel, unseen: Sequence[Unseen]) -> str | None:
+    """What says that the model foresees positions and deflections worse than the declared one."""
+    squares: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    for record, since in unseen:
+        part = record.rows(record.sequence >= since)
+        try:
+            runs = [free_run(part, model, choice("horizon")) for model in (declared, written)]
+        except EstimatorError:  # too short, or no stiffness is declared
+            continue
+        size = np.std(runs[0].measured_rad, axis=0) + _NOTHING
+        for mine, run in zip(squares, runs, strict=True):
+            error = np.mean((run.residual_rad / size) ** 2, axis=1)
+            mine += [np.mean(block) for block in np.array_split(error, whole("groups"))]
+    figure = _Figure(*map(np.array, squares))
+    if not figure.rises(choice("floor") ** 2):
+        return None
+    new, old = figure.rms
+    return (
+        f"free runs over held-out data err by {new:.1%} of the motion with the new model, {old:.1%} with the "
+        "declared one"
+    )
 
 
 def _later(one: Unseen, sequence: int) -> bool:

@@ -166,6 +166,7 @@ NO_CHOICE = {  # mathematics, units, rounding, and what a format or the literatu
     "gate.usable._ABSURD": "one over the rounding",
     "model.HIGHEST_ORDER": "of a polynomial in the joint file",
     "model_monitor._LEAST_SECONDS": "that a standard deviation takes",
+    "harm._NOTHING": "keeps a ratio finite",
     "model_monitor._NOTHING": "keeps a logarithm finite",
     "sample.SIGMA_95": "quantile of the normal distribution",
 }

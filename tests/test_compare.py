@@ -58,7 +58,7 @@ def test_friction_that_nobody_declared_is_in_the_curve_and_in_the_free_run(runs)
 def test_the_verb_writes_a_page_and_numbers(runs, capsys):
     healthy = str(runs / "healthy.csv")
     assert cli.main(["compare", str(ELBOW), healthy, "--horizon", "1", "--out", str(runs / "page")]) == 0
-    assert "fit of A" in capsys.readouterr().out
+    assert "fit of healthy.csv" in capsys.readouterr().out
     document = json.loads((runs / "page" / "comparison.json").read_text())
     assert document["free_runs"][0]["horizon_s"] == [1.0, 1.0]
     page = (runs / "page" / "comparison.html").read_text()

@@ -148,10 +148,13 @@ def test_what_is_printed_is_what_is_written(model, link, run, folder):
     written = tomllib.loads(text)
     owner = written.get("link", {})
     assert document.get("link", {}) == owner
-    *_, last = tables
+    *_, last, _ = tables
     if owner:
         _same(last, dict(_numbers(owner.get("dynamics", {}))) | _of_effects(owner))
     motors = written["motor"]
+    *tables, simulated = tables  # its numbers are of the free run
+    fits = document["free_runs"][0]["fitted"]
+    assert [(name, f"{fits[name]:.1f} %") for name in fits] == simulated and min(fits.values()) > 50.0
     assert len(tables) == len(motors) + bool(owner)
     for table, motor, entry in zip(tables, motors, document["transmissions"], strict=False):
         _same(table, _of_motor(motor))

@@ -60,13 +60,11 @@ def run(args: argparse.Namespace) -> int:
 def _fit(args: argparse.Namespace, folder: Path | None) -> None:
     """Fit, print, and write the requested files, plots into `folder`."""
     from drivelink import analysis  # takes a second; the arguments are checked
-    from drivelink.output.fitreport import sections
 
     options = {"bandwidth_hz": args.bandwidth_hz, "names": args.map, "strict": args.strict}
     made = analysis.fit(args.recording, args.joint, warn=warn, **options)
     document = made.as_json()
-    tables = sections(made.found, [path.name for path in args.recording], made.runs.units)
-    conclude(args.json, document, tables)  # before anything is written: a full disk loses no result
+    conclude(args.json, document, made.sections())  # before anything is written: a full disk loses no result
     written = []
     if args.out is not None:
         written.append(args.out / "fit.json")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from drivelink.output import plots
 from drivelink.output.document import Chart, Document, Grid, Paragraph, Rows, Section
 from drivelink.output.numbers import Units, number, value_and_interval
+from estimator.choices import choice
 from estimator.comparison import Correlation, Curve, correlations, friction_curve, stiffness_curve
 from estimator.errors import EstimatorError
 from estimator.freerun import FreeRun, free_run
@@ -22,7 +24,7 @@ from estimator.sample import SIGMA_95, Record
 _POINTS = 200
 _SHOWN_S = 10.0  # of a free run in the picture
 _REACH_RAD, _SPEED_RAD_S = 0.2, 1.0  # of curves where no recording says how far
-_HORIZON_S = 1.0  # of a report's free run
+_DIVERGES = -100.0  # %: further off than twice the motion's size
 _WIDTH = 4.6  # inches: half a page
 
 
@@ -121,9 +123,8 @@ class Comparison:
     def sections(self) -> list[Section]:
         """Return the page's sections."""
         sections = [Section("curves", [self._differences()])]
-        if self.runs:
-            sections.append(Section("free run", [self._fits()]))
         for side, *runs in self.runs:
+            sections.append(fits(dict(zip("AB", runs, strict=True)), side.name))
             charts: list[Any] = [
                 Chart(partial(self._over, side, runs), "measured and simulated"),
                 Chart(
@@ -147,15 +148,6 @@ class Comparison:
             a, b = (value_and_interval(value, SIGMA_95 * one.std)[0] for value in (one.a, one.b))
             rows.append((f"{one.kind}, motor {one.motor}", at, f"{a} {unit}", f"{b} {unit}", apart))
         return Grid(("where they differ most", "at", "A", "B", "apart"), rows)
-
-    def _fits(self) -> Grid:
-        rows: Rows = []
-        for side, a, b in self.runs:
-            rows.append((f"{side.name}, windows of {a.horizon_s:.3g} s",))
-            for name in a.channels:
-                fits = (one[name] for one in (a.fit_percent, b.fit_percent, a.coasting_percent))
-                rows.append((_in_words(name), *(f"{number(fit)} %" for fit in fits)))
-        return Grid(("channel", "fit of A", "fit of B", "at constant velocity"), rows)
 
     def _over(self, side: Side, runs: Sequence[FreeRun]) -> Figure:
         run, j = runs[0], self.channel(runs[0])
@@ -192,15 +184,52 @@ class Comparison:
         return figure
 
 
-def beside(name: str, before: JointModel, after: JointModel, record: Record, units: Units) -> list[Section]:
+def simulated(record: Record, **models: JointModel) -> dict[str, FreeRun]:
+    """Return the free runs of a report, by name, of those models that can be simulated."""
+    made = {}
+    for name, model in models.items():
+        with contextlib.suppress(EstimatorError):
+            made[name] = free_run(record, model, choice("horizon"))
+    return made
+
+
+def fits(runs: Mapping[str, FreeRun], of: str) -> Section:
+    """Tabulate how well free runs of a recording fit, by channel; empty without a run."""
+    first = next(iter(runs.values()), None)
+    if first is None:
+        return Section("", [])
+    each = [*(run.fit_percent for run in runs.values()), first.coasting_percent]
+    rows: Rows = [
+        (_in_words(name), *("diverges" if fit[name] < _DIVERGES else f"{fit[name]:.1f} %" for fit in each))
+        for name in first.channels
+    ]
+    heads = (f"fit of {of}", *runs, "at constant velocity")
+    return Section(f"free run, from measured states every {first.horizon_s:.3g} s", [Grid(heads, rows)])
+
+
+def fits_json(runs: Mapping[str, FreeRun], of: str) -> dict[str, Any]:
+    """Return the same as a document."""
+    document: dict[str, Any] = {"recording": of}
+    for name, run in runs.items():
+        document |= {"horizon_s": run.horizon_s, "constant_velocity": dict(run.coasting_percent)}
+        document[name] = dict(run.fit_percent)
+    return document
+
+
+def beside(
+    name: str,
+    models: Sequence[JointModel],
+    runs: Mapping[str, FreeRun],
+    record: Record,
+    units: Units,
+) -> list[Section]:
     """Return a report's sections: a model as declared (A) and as found (B) beside the machine.
 
     None where one of them cannot be simulated.
     """
-    try:
-        first, second = (free_run(record, model, _HORIZON_S) for model in (before, after))
-    except EstimatorError:
+    if len(runs) < len(models):
         return []
+    (before, after), (first, second) = models, runs.values()
     declared, found = Side("as declared", before, record), Side("as found", after, None)
     made = Comparison((declared, found), ((declared._replace(name=name), first, second),), units)
     about = Paragraph("A: the model as declared. B: with what was found.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,11 @@ from matplotlib.figure import Figure
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile, effect_entry, link_entry
 from drivelink.output import plots
+from drivelink.output.comparison import fits, fits_json
 from drivelink.output.document import PARAMETER_HEAD, Grid, Lines, Rows, Section, parameter_rows
 from drivelink.output.numbers import Units, bare_name, number
 from estimator.batch import TransmissionFit
+from estimator.freerun import FreeRun
 from estimator.identify import Identified
 from estimator.model import Effect, Motor
 from estimator.sample import SIGMA_95, FloatArray
@@ -27,15 +29,20 @@ _IN_BIN = 15  # rows per median point of the lines through the residuals
 _SHOWN = 3  # parameters beside the curve
 
 
-def as_json(found: Identified, names: Sequence[str], notes: Iterable[str]) -> dict[str, Any]:
+def as_json(
+    found: Identified, names: Sequence[str], runs: Sequence[Mapping[str, FreeRun]], notes: Iterable[str]
+) -> dict[str, Any]:
     """Return the content of fit.json.
 
     Args:
+        found: the fit.
         names: of the recordings.
+        runs: of each recording: the free run of the fitted model.
         notes: what the gate says of them.
     """
     pairs = zip(found.fits, found.model.motors, strict=True)
     document: dict[str, Any] = {"transmissions": [_entry(one, motor) for one, motor in pairs]}
+    document["free_runs"] = [fits_json(*one) for one in zip(runs, names, strict=True)]
     if link := link_entry(found.model):
         document["link"] = link
     if found.link_std:
@@ -69,8 +76,10 @@ def _entry(one: TransmissionFit, motor: Motor) -> dict[str, Any]:
     return entry
 
 
-def sections(found: Identified, names: Sequence[str], units: Units) -> list[Section]:
-    """Tabulate what was fitted."""
+def sections(
+    found: Identified, names: Sequence[str], runs: Sequence[Mapping[str, FreeRun]], units: Units
+) -> list[Section]:
+    """Tabulate what was fitted; arguments as in `as_json`."""
     made = []
     for index, (one, motor) in enumerate(zip(found.fits, found.model.motors, strict=True), start=1):
         rows: Rows = []
@@ -90,6 +99,7 @@ def sections(found: Identified, names: Sequence[str], units: Units) -> list[Sect
                 rows += parameter_rows(name, x, found.link_std.get(name), units)
         rows += _effects(found.model.link_effects, units)
         made.append(Section("link", [Grid(PARAMETER_HEAD, rows)]))
+    made += [fits(*one) for one in zip(runs, names, strict=True)]
     made.append(Section("", [Lines(tuple(found.notes))]))
     if len(names) > 1:
         each: Rows = [

@@ -226,37 +226,12 @@ def test_what_does_not_agree_with_the_bus_is_one_finding(rig, old, new, severity
     assert [line for line in said if all(word in line for word in words)], said
 
 
-@pytest.mark.parametrize("path", OURS, ids=lambda path: path.name)
-def test_from_an_eds_file_alone_the_mapping_is_shown(path):
-    report = examine_eds(path)
-    facts = report.sections[0].facts
-    if "encoder" in path.name:
-        assert facts["mapping"][0]["objects"] == ["0x6004:00:32"]
-        return
-    mapped = [entry for frame in facts["mapping"] for entry in frame["objects"]]
-    assert "0x6064:00:32" in mapped
-    assert "0x6041:00:16" in mapped
-    assert facts["motor_position"] == ["0x6064:00"]
-    assert report.worst < Severity.ERROR
-
-
 def test_a_check_that_was_asked_for_is_planned_and_not_offered(rig):
     report = examine(parse(joint_on(rig, extra='checks = ["current"]')), Path(), 0.2)
     said = texts(report)
     assert any("will be configured to send" in line and "6078:00" in line for line in said)
     assert not any(line.startswith("cross-check: current") for line in said)
     assert any(line.startswith("cross-check: velocity") for line in said)
-
-
-def test_a_sheet_without_what_is_needed_says_what_is_missing(tmp_path):
-    text = eds_text("VendorName=Poor", x6041=(6, ""), x6064=(4, ""))
-    (tmp_path / "poor.eds").write_text("PDOMapping=0".join(text.rsplit("PDOMapping=1", 1)))
-    report = examine_eds(tmp_path / "poor.eds")
-    said = texts(report, Severity.ERROR)
-    assert any("motor position: 0x6064:00 is there, but cannot be mapped" in line for line in said)
-    assert any("motor torque: no object" in line for line in said)
-    assert "mapping" not in report.sections[0].facts  # of what is left there is nothing to plan
-    assert main(["doctor", "--eds", str(tmp_path / "poor.eds")]) == 1
 
 
 def sheet_of(*addresses, tmp_path):

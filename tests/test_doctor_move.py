@@ -181,13 +181,6 @@ def once(ask: Callable[..., str], start: str, then: str) -> Callable[..., str]:
     return answer
 
 
-def test_an_amount_has_units_and_nonsense_is_asked_again():
-    rig = HandMovedJoint({}, {"Turn": "lots"})
-    rig.ask = once(rig.ask, "Turn", "1.536 rad")  # type: ignore[method-assign]
-    assert check_by_hand(joint(), rig, rig).paste == []
-    assert "expected an amount like 45 or 0.8 rad, got lots" in rig.said
-
-
 def test_of_two_motors_each_torque_has_its_own_gear_and_what_is_not_read_is_not_judged():
     def pushed(wrong: dict[str, float], unread: str = "") -> ByHand:
         rig = HandMovedJoint(wrong, {"Push": "3.0"})

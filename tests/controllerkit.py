@@ -26,7 +26,7 @@ from sim.faults import Faults  # noqa: E402
 from sim.network import Network  # noqa: E402
 
 SPRING = {"k_nm_rad": 0.5, "c": 1.75}
-QUICK = Settings(identify_s=3.0, way_s=0.8, rest_s=0.2)
+QUICK = Settings(identify_s=1.5, way_s=0.8, rest_s=0.2)
 SAFE_WITHIN_S = 0.020
 _channels = itertools.count()
 

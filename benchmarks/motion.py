@@ -22,8 +22,8 @@ import scene
 from world import World, simulate
 
 from estimator.diagnosis import Diagnosis, diagnose
+from estimator.diagnosis.fourier import Limits, Shape
 from estimator.diagnosis.motion import design
-from estimator.diagnosis.shape import Limits, Shape
 from estimator.driven import Path
 from estimator.model import JointModel, Motor, Transmission
 

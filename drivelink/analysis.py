@@ -25,8 +25,8 @@ from drivelink.recording.corrections import gate
 from drivelink.recording.mapping import joint_of
 from estimator.diagnosis import Diagnosis
 from estimator.diagnosis import diagnose as _diagnose
+from estimator.diagnosis.fourier import Limits
 from estimator.diagnosis.motion import NextMotion, design
-from estimator.diagnosis.shape import Limits
 from estimator.errors import EstimatorError
 from estimator.freerun import FreeRun, free_run
 from estimator.harm import Unseen, harm, harm_of_parts

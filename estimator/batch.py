@@ -17,10 +17,10 @@ import numpy as np
 from estimator.choices import choice, least_rows, log_odds
 from estimator.diagnosis.bandwidth import choose_bandwidth, widest
 from estimator.diagnosis.covariance import design_effects, hac_covariance
+from estimator.diagnosis.findings import DELAYS, stamped_wrongly
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.heldout import Held, held_out
 from estimator.diagnosis.hypothesis import Fitted, Problem
-from estimator.diagnosis.outcome import DELAYS, stamped_wrongly
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError

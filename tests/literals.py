@@ -25,7 +25,7 @@ OF_FILES = {
     "core/src/causes.rs": "the table of causes: amplitudes' priors",
 }
 REASONS: dict[str, dict[str, str]] = {
-    "diagnosis/base.py": {
+    "diagnosis/law_parameters.py": {
         "0.9999 1.0001": "keeps a shape inside its open interval",
         "0.02 1.02 1.1 20.0": "ends of a grid of shapes that is refined afterwards",
         "1.001": "keeps the largest deflection inside the law's reach",
@@ -36,15 +36,21 @@ REASONS: dict[str, dict[str, str]] = {
         "0.9 0.05 0.95 0.96 0.99 0.01 0.4": "quantiles of what was measured",
         "20.0": "largest exponent that is told from a stop",
     },
-    "diagnosis/evidence.py": {"0.001": "relative change that ends an iteration", "0.0001": "likewise, of x"},
+    "diagnosis/regression.py": {
+        "0.001": "relative change that ends an iteration",
+        "0.0001": "likewise, of x",
+    },
     "diagnosis/frame.py": {"0.45": "of the sampling rate: below half of it"},
     "diagnosis/hypothesis.py": {
         "0.01": "quantile of the steps of a reading: one count",
         "0.7": "place of held-out blocks: not the middle of a period",
     },
     "diagnosis/search.py": {"1.75": "last point of a grid of delays in octaves"},
-    "diagnosis/stack.py": {"0.001": "relative step of a difference", "0.7": "ln 2: factors of at most two"},
-    "diagnosis/shape.py": {"15.0 30.0 60.0": "quintic smooth step, its slope and bend"},
+    "diagnosis/design_matrix.py": {
+        "0.001": "relative step of a difference",
+        "0.7": "ln 2: factors of at most two",
+    },
+    "diagnosis/fourier.py": {"15.0 30.0 60.0": "quintic smooth step, its slope and bend"},
     "filters.py": {"14.0": "time constants until e^-14 is below 1e-6"},
     "gate/causes.py": {"1.3": "a factor this near to a unit's is that unit"},
     "gate/balance.py": {
@@ -149,7 +155,7 @@ NO_CHOICE = {  # mathematics, units, rounding, and what a format or the literatu
     "diagnosis.motion._GENERATIONS": "effort of a search",
     "diagnosis.motion._POPULATION": "effort of a search",
     "diagnosis.motion._STEPS": "of a second-order integrator in a period of the bandwidth",
-    "diagnosis.shape._CUBIC": "least degree whose bend is not constant",
+    "diagnosis.fourier._CUBIC": "least degree whose bend is not constant",
     "driven._NEWTON": "steps, that converge quadratically",
     "driven._PASSES": "of a fixed point whose error falls by the effect's share each time",
     "driven._RESOLVED": "of a second-order integrator: an oscillation of which a step is a twelfth",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from estimator.diagnosis import diagnose
-from estimator.diagnosis.outcome import stamped_wrongly
+from estimator.diagnosis.findings import stamped_wrongly
 from estimator.identify import identify
 from estimator.sample import Record
 

@@ -17,9 +17,9 @@ from estimator.diagnosis import Diagnosis, Errors, Finding, diagnose
 from estimator.diagnosis.curves import _bases
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Problem
-from estimator.diagnosis.judge import Judge, _Judged
-from estimator.diagnosis.openorder import raised
+from estimator.diagnosis.order import raised
 from estimator.diagnosis.search import Search
+from estimator.diagnosis.verdict import Judge, _Judged
 from estimator.identify import identify
 from estimator.model import JointModel, Motor, Transmission
 from estimator.sample import Record
@@ -92,7 +92,7 @@ def test_a_model_that_leaves_the_torque_of_other_data_is_not_sufficient(held, ve
     judge.problem, judge.found = SimpleNamespace(frames=[None]), None
     judge.held = SimpleNamespace(errors=lambda *_: Errors(held, held, held, held))
     monkeypatch.setattr(Judge, "_left", lambda *_: 0.1)
-    monkeypatch.setattr("estimator.diagnosis.judge.poor", lambda _: False)
+    monkeypatch.setattr("estimator.diagnosis.verdict.poor", lambda _: False)
     assert judge._named([])[0] == verdict
 
 

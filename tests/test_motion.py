@@ -10,7 +10,7 @@ import pytest
 from drivelink import cli, jointfile
 from drivelink.demo.simulate import alter, world_from_joint
 from estimator.diagnosis import motion
-from estimator.diagnosis.shape import Limits, Shape
+from estimator.diagnosis.fourier import Limits, Shape
 from estimator.driven import driven
 from estimator.freerun import free_run
 from estimator.model import Effect

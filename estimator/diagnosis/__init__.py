@@ -1,5 +1,6 @@
 """Traces a residual to a physical effect: locate, select, judge."""
 
+from estimator.diagnosis.workflow import diagnose
 from estimator.diagnosis.result import (
     Curve,
     Diagnosis,
@@ -12,7 +13,6 @@ from estimator.diagnosis.result import (
     StiffnessCurve,
     Verdict,
 )
-from estimator.diagnosis.tracing import diagnose
 
 __all__ = [
     "Curve",

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.choices import choice, whole
-from estimator.diagnosis.base import Base, start, with_flexibility
-from estimator.diagnosis.beliefs import OF_RUN, everyday
-from estimator.diagnosis.evidence import Posterior, Regression
+from estimator.diagnosis.corrections import READINGS, corrected, restored
+from estimator.diagnosis.declared import declared_corrections, declared_torque
+from estimator.diagnosis.design_matrix import Extra, Pinned, Slot, Stack, Term, step_of, stepped
 from estimator.diagnosis.frame import Corrections, Frame, Signals
-from estimator.diagnosis.known import declared_corrections, declared_torque
-from estimator.diagnosis.readings import READINGS, corrected, restored
-from estimator.diagnosis.stack import Extra, Pinned, Slot, Stack, Term, step_of, stepped
+from estimator.diagnosis.joint_priors import OF_RUN, everyday
+from estimator.diagnosis.law_parameters import Base, start, with_flexibility
+from estimator.diagnosis.regression import Posterior, Regression
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.model import JointModel

@@ -18,13 +18,13 @@ from scipy.optimize import Bounds, differential_evolution, lsq_linear
 from scipy.stats import qmc
 
 from estimator.choices import choice, whole
-from estimator.diagnosis.base import start
 from estimator.diagnosis.candidates import Candidate, grid
+from estimator.diagnosis.fourier import Limits, Shape
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Fitted, Problem, Term, count_of
+from estimator.diagnosis.law_parameters import start
 from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
-from estimator.diagnosis.shape import Limits, Shape
 from estimator.driven import driven
 from estimator.errors import EstimatorError
 from estimator.model import Effect, JointModel, LinkDynamics, Motor

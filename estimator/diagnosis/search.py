@@ -16,11 +16,11 @@ import numpy as np
 from scipy.special import softmax
 
 from estimator.choices import choice, whole
-from estimator.diagnosis.beliefs import effect_std
 from estimator.diagnosis.candidates import Candidate, columns, grid, members
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Fitted, Keys, Problem, Term
+from estimator.diagnosis.joint_priors import effect_std
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray
 

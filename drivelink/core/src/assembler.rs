@@ -344,7 +344,7 @@ impl Assembler {
         let decoder = &mut self.decoders[index];
         let statusword = decoder.store(data);
         for field in &mut decoder.fields {
-            self.values[field.target] = field.take(data);
+            self.values[field.target] = field.decode(data);
             self.answered[field.target] = self.sequence;
         }
         let node = &mut self.nodes[decoder.node];

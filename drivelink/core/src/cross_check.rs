@@ -174,7 +174,7 @@ impl CrossCheck {
     }
 
     /// Both readings at the SYNC of this number; whether that ended a block.
-    pub fn take(&mut self, sequence: i64, x: f64, y: f64) -> bool {
+    pub fn add(&mut self, sequence: i64, x: f64, y: f64) -> bool {
         if !(x.is_finite() && y.is_finite()) {
             return false;
         }

@@ -72,7 +72,7 @@ impl Field {
     /// its range between two readings, be there a gap or not. The first reading is taken as the one nearest zero: an
     /// unsigned absolute encoder a little below its zero is not a turn away from it. So is one that no motion
     /// explains, see [`WIDE`].
-    pub fn take(&mut self, data: &[u8]) -> f64 {
+    pub fn decode(&mut self, data: &[u8]) -> f64 {
         let mut count = self.place.read(data);
         if self.range > 0 {
             let half = self.range / 2;
@@ -254,7 +254,7 @@ mod tests {
         let mut field = Field::new(&position(16, false, 0), 0, 0);
         let truth: Vec<i64> = (0..2000).map(|k| 100 * k - 300).collect();
         for &count in &truth {
-            assert_eq!(field.take(&(count as u16).to_le_bytes()), count as f64);
+            assert_eq!(field.decode(&(count as u16).to_le_bytes()), count as f64);
         }
     }
 
@@ -269,7 +269,7 @@ mod tests {
     #[test]
     fn the_first_reading_is_the_one_nearest_zero() {
         let mut field = Field::new(&position(32, false, 5000), 0, 0);
-        assert_eq!(field.take(&4900u32.to_le_bytes()), -100.0);
-        assert_eq!(field.take(&100u32.to_le_bytes()), 100.0);
+        assert_eq!(field.decode(&4900u32.to_le_bytes()), -100.0);
+        assert_eq!(field.decode(&100u32.to_le_bytes()), 100.0);
     }
 }

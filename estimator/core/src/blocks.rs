@@ -1,7 +1,7 @@
 //! What one motor's balance has taught: blocks of rows, and the algebra on their sum.
 
-mod doubt;
-mod known;
+mod changes;
+mod readout;
 mod solve;
 
 use serde::{Deserialize, Serialize};
@@ -193,7 +193,7 @@ impl Blocks {
 
     /// What follows is not of the same moments: half a block is a block, fewer rows wait for more. A restart is judged
     /// by what follows it alone.
-    pub fn cut(&mut self) {
+    pub fn close_early(&mut self) {
         if self.suspected {
             self.open = Gram::default();
         } else if self.open.rows >= 0.5 * self.rows {
@@ -294,16 +294,16 @@ impl Blocks {
             }
             self.good = 0;
             self.waiting.push(block);
-            return self.doubt(odds);
+            return self.decide(odds);
         }
         self.good += 1;
-        self.keep(block);
+        self.push(block);
         if self.doubting && self.good < CONVINCING {
             return Closed::Unexplained;
         }
         if let Some(odds) = self.judge_latest() {
             self.doubt_latest();
-            return self.doubt(odds);
+            return self.decide(odds);
         }
         self.end_doubt();
         self.solve();
@@ -337,7 +337,7 @@ impl Blocks {
         (EARLY * EARLY * balance::variance(rows, balance::TORQUE)).max(fitted * fitted)
     }
 
-    fn keep(&mut self, block: Gram) {
+    fn push(&mut self, block: Gram) {
         let peak = std::mem::take(&mut self.peak);
         if self.ring.len() < BLOCKS {
             self.ring.push(block);

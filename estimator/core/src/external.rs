@@ -107,19 +107,19 @@ impl Carried {
     }
 }
 
-/// What was said last; and mean squares of the flexibility torque's difference between both sides, and of the link's.
+/// What was published last; and mean squares of the flexibility torque's difference between both sides, and of the link's.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub struct Said {
+pub struct Latest {
     now: External,
     squares: Option<[f64; 2]>,
 }
 
-impl Said {
-    fn nothing() -> Said {
-        Said { now: External::nothing(0), squares: None }
+impl Latest {
+    fn nothing() -> Latest {
+        Latest { now: External::nothing(0), squares: None }
     }
 
-    fn say(&mut self, external: External, span_s: f64) -> External {
+    fn publish(&mut self, external: External, span_s: f64) -> External {
         self.now = external;
         if external.status & status::VALID != 0 {
             let now = [external.difference, external.link_torque].map(|torque| torque * torque);
@@ -132,7 +132,7 @@ impl Said {
 
     /// The same of a sample that was not used.
     #[must_use]
-    pub fn carry(&self, sequence: u64) -> External {
+    pub fn repeat(&self, sequence: u64) -> External {
         self.now.void(sequence)
     }
 
@@ -170,8 +170,8 @@ pub struct LinkMomentum {
     dry: f64,          // undeclared dry friction, as a share of the torque carried
     errors: LinkErrors,
     judge: Judge,
-    /// See [`Said`].
-    pub said: Said,
+    /// See [`Latest`].
+    pub latest: Latest,
 }
 
 impl LinkMomentum {
@@ -210,7 +210,7 @@ impl LinkMomentum {
             skew: priors.encoder_delay * period_s,
             dry: priors.coulomb_friction,
             errors: LinkErrors::default(),
-            said: Said::nothing(),
+            latest: Latest::nothing(),
         })
     }
 
@@ -218,7 +218,7 @@ impl LinkMomentum {
     pub fn reset(&mut self) {
         self.judge.reset();
         self.errors = LinkErrors::default();
-        self.said = Said::nothing();
+        self.latest = Latest::nothing();
         self.unsettled = self.settle;
     }
 
@@ -275,12 +275,12 @@ impl LinkMomentum {
         }
     }
 
-    /// What is said of a sample that was used.
+    /// What is latest of a sample that was used.
     ///
     /// `valid`: whether the estimate is; `noise`: variance of q's noise, rad².
     pub fn conclude(&mut self, sequence: u64, carried: &Carried, noise: f64, valid: bool) -> External {
         if !self.known {
-            return self.said.say(External::nothing(sequence), self.period);
+            return self.latest.publish(External::nothing(sequence), self.period);
         }
         let link = &self.link;
         let [position, velocity, acceleration] = self.position;
@@ -309,7 +309,7 @@ impl LinkMomentum {
         let late = late * late;
         let around = carried.variance + read + unknown + late;
         let valid = valid && self.unsettled <= 0 && (sum + around + white).is_finite();
-        let (torque, contact) = self.judge.see(sum - off, self.carried[0], around, white, valid);
+        let (torque, contact) = self.judge.judge(sum - off, self.carried[0], around, white, valid);
         let usual = torque.abs() <= SURE * (around + white).sqrt();
         if valid && usual && !contact {
             // Errors of readings last as long as the filter does; that of the curve does not average out at all.
@@ -325,7 +325,7 @@ impl LinkMomentum {
             link_torque: self.measured[0] - own,
             difference: sum - self.measured[0],
         };
-        self.said.say(external, self.period)
+        self.latest.publish(external, self.period)
     }
 }
 

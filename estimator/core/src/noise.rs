@@ -28,7 +28,7 @@ impl NoiseMeter {
     }
 
     /// One sample.
-    pub fn see(&mut self, value: f64, period_s: f64) {
+    pub fn update(&mut self, value: f64, period_s: f64) {
         let [a, b, c] = self.past;
         self.past = [value, a, b];
         if self.known < 3 {
@@ -63,7 +63,7 @@ mod tests {
     fn a_parabola_has_no_noise_but_that_of_its_counts() {
         let mut meter = NoiseMeter::default();
         for k in 0..500 {
-            meter.see(1e-4 * f64::from(k * k), 1e-3);
+            meter.update(1e-4 * f64::from(k * k), 1e-3);
         }
         assert!(meter.variance(f64::INFINITY) < 1e-18);
         assert!((meter.variance(1e-3) - 1e-6 / 12.0).abs() < 1e-12);
@@ -74,7 +74,7 @@ mod tests {
         // ±a has third differences of ±8 a: 64/20 of its variance.
         let mut meter = NoiseMeter::default();
         for k in 0..5000 {
-            meter.see(if k % 2 == 0 { 0.1 } else { -0.1 }, 1e-3);
+            meter.update(if k % 2 == 0 { 0.1 } else { -0.1 }, 1e-3);
         }
         assert!((meter.variance(f64::INFINITY) / 0.01 - 3.2).abs() < 1e-6);
     }

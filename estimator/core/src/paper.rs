@@ -275,7 +275,7 @@ impl Paper {
     /// See [`PaperMomentum::consistency`].
     #[must_use]
     pub fn consistency(&self) -> Option<[f64; 2]> {
-        self.link.as_ref()?.said.consistency()
+        self.link.as_ref()?.latest.consistency()
     }
 
     /// The coefficients of each transmission's polynomial with their standard deviations, or the black box's
@@ -335,7 +335,7 @@ impl Paper {
             self.external = Some(if accepted.periods > 0 {
                 link.update(sample, accepted.periods, estimate.flexibility_torque, balance, valid)
             } else {
-                link.said.carry(sample.sequence)
+                link.latest.repeat(sample.sequence)
             });
         }
         estimate

@@ -185,7 +185,7 @@ impl Robust {
     /// See [`crate::external::Said::consistency`].
     #[must_use]
     pub fn consistency(&self) -> Option<[f64; 2]> {
-        self.momentum.as_ref()?.said.consistency()
+        self.momentum.as_ref()?.latest.consistency()
     }
 
     /// Largest misfit among the motors' balances, N·m; NaN until there is a model.
@@ -239,7 +239,7 @@ impl Robust {
             (None, before) => before.map(|(was, left)| (was, left - 1)).filter(|(_, left)| *left > 0),
         };
         if accepted.periods == 0 {
-            return self.carry(sample.sequence, accepted.status);
+            return self.hold(sample.sequence, accepted.status);
         }
         self.begins |= accepted.restart;
         if let Some(jumps) = accepted.jumps {
@@ -247,7 +247,7 @@ impl Robust {
             self.jumped = Some(std::array::from_fn(|k| before[k] + jumps[k]));
         }
         let Some(corrected) = self.corrections.correct(sample, accepted.restart) else {
-            return self.carry(sample.sequence, accepted.status);
+            return self.hold(sample.sequence, accepted.status);
         };
         self.rejected = 0;
         self.measured = corrected.present.external_torque;
@@ -330,7 +330,13 @@ impl Robust {
             }
             if look {
                 let gain = self.rate_gain * (noise[0] + noise[1]).sqrt();
-                side.look(&self.link, now.at.deflection(i), gain, usable, self.looks as f64 * period);
+                side.update_excitation(
+                    &self.link,
+                    now.at.deflection(i),
+                    gain,
+                    usable,
+                    self.looks as f64 * period,
+                );
             }
             if usable && side.excited {
                 side.blocks.spoilt = self.refused.is_some();
@@ -370,7 +376,7 @@ impl Robust {
         let doubtful = !usable || self.sides.iter().any(|side| side.doubtful);
         let period = self.period;
         let see = |meter: &mut NoiseMeter, value: f64| {
-            if doubtful && meter.is_known() { meter.restart() } else { meter.see(value, period) }
+            if doubtful && meter.is_known() { meter.restart() } else { meter.update(value, period) }
         };
         see(&mut self.noise[self.motors], now.at.link);
         for i in 0..self.motors {

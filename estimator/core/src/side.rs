@@ -139,13 +139,13 @@ impl Side {
 
     /// What follows is not as what was before.
     pub fn cut(&mut self) {
-        self.blocks.cut();
+        self.blocks.close_early();
         self.judge();
     }
 
     /// Filters at rest where the joint is now; what has been learned is kept.
     pub fn restart(&mut self, theta: f64, phi: f64, torque: f64) {
-        self.blocks.cut();
+        self.blocks.close_early();
         self.balance.restart(theta, phi, torque);
         self.deflection.restart(theta, phi);
         self.judge();
@@ -162,7 +162,7 @@ impl Side {
     pub fn move_zero(&mut self, known: bool) {
         self.unconfirmed_s = AHEAD_S;
         if known {
-            self.blocks.cut();
+            self.blocks.close_early();
         } else {
             self.blocks.lose_zero();
             self.balance.forget_range();
@@ -259,7 +259,7 @@ impl Side {
     }
 
     /// Does the motion reveal the stiffness? `gain`: standard deviation of the deflection's rate.
-    pub fn look(&mut self, link: &Channel, phi: f64, gain: f64, usable: bool, dt: f64) {
+    pub fn update_excitation(&mut self, link: &Channel, phi: f64, gain: f64, usable: bool, dt: f64) {
         if self.blocks.are_few() {
             self.balance.fit_widths(phi);
         }
@@ -330,7 +330,7 @@ impl Side {
     }
 
     /// The torque and stiffness that the deflection's filter goes on with.
-    pub fn act(&mut self) {
+    pub fn predict(&mut self) {
         if self.rigid {
             return;
         }
@@ -338,14 +338,14 @@ impl Side {
         match known.filter(|known| self.fits && known.stiffness > 0.0) {
             Some(known) => {
                 (self.stiffness, self.acting) =
-                    (known.stiffness, known.torque + self.blocks.rest(self.deflection.rate()));
+                    (known.stiffness, known.torque + self.blocks.damping_and_offset(self.deflection.rate()));
             }
-            None => (self.stiffness, self.acting) = (0.0, self.left(0.0)),
+            None => (self.stiffness, self.acting) = (0.0, self.balance_torque(0.0)),
         }
     }
 
     /// What the motor's balance leaves as the transmission's torque (eq 14), brought up by its slope.
-    fn left(&self, ahead_s: f64) -> f64 {
+    fn balance_torque(&self, ahead_s: f64) -> f64 {
         let (motor, tau, x) = self.balance.filtered();
         let value = self.inertia * motor[2] + self.damping * motor[1] + x[0] - tau[0];
         let rate = self.inertia * motor[3] + self.damping * motor[2] + x[1] - tau[1];

@@ -217,7 +217,7 @@ impl Spring {
     }
 
     /// Move to the parameters that a solution has found; what cannot be is cut off.
-    pub fn take(&mut self, x: &Vector) {
+    pub fn move_by(&mut self, x: &Vector) {
         let base = self.base();
         for (i, unknown) in SPRING.enumerate().take(self.size) {
             self.alpha[i] = base[i] + x[unknown];

@@ -61,7 +61,7 @@ impl Assembler {
                 }
             };
             if let (Some(first), Some(second)) = (first, second) {
-                ended |= check.take(self.sequence, first, second);
+                ended |= check.add(self.sequence, first, second);
             }
         }
         if ended {

@@ -10,7 +10,7 @@ fn run(check: &mut CrossCheck, from: i64, to: i64, reading: impl Fn(f64, f64) ->
     let mut seed = from as u64 + 1;
     for k in from..to {
         let (x, y) = reading(k as f64 * 1e-3, random(&mut seed));
-        check.take(k, x, y);
+        check.add(k, x, y);
     }
 }
 
@@ -84,7 +84,7 @@ fn cycles_that_are_lost_cost_nothing_and_nothing_is_tested_at_rest() {
     for k in 0..60_000 {
         if random(&mut seed) > -0.8 {
             let (x, y) = healthy(k as f64 * 1e-3, 0.0);
-            check.take(k, x, y);
+            check.add(k, x, y);
         }
     }
     assert_eq!(check.verdict(), Verdict::Agrees, "{}", check.statistic);
@@ -101,7 +101,7 @@ fn the_statistic_errs_no_more_often_than_declared() {
     for k in 0..600_000 {
         let t = k as f64 * 1e-3;
         let y = counts(velocity(t) + 0.5 * random(&mut seed), 0.01);
-        if check.take(k, counts(velocity(t) + 0.5 * random(&mut seed), 0.01), y) && k > 10_000 {
+        if check.add(k, counts(velocity(t) + 0.5 * random(&mut seed), 0.01), y) && k > 10_000 {
             (sum, number, worst) = (sum + check.statistic, number + 1.0, worst.max(check.statistic));
         }
     }

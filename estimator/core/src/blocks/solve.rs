@@ -183,7 +183,7 @@ impl Blocks {
             });
             let before = chosen.x;
             self.residual = frame.residual(&chosen.x, chosen.set);
-            self.spring.take(&before);
+            self.spring.move_by(&before);
             if step + 1 < STEPS && far && !self.spring.is_settled() {
                 continue;
             }

@@ -52,7 +52,7 @@ impl ContactTest {
     /// One sample: whether something touches the link.
     ///
     /// `band`: what no contact is, N·m; `noise`: standard deviation of the rest.
-    pub fn see(&mut self, torque: f64, band: f64, noise: f64) -> bool {
+    pub fn update(&mut self, torque: f64, band: f64, noise: f64) -> bool {
         self.ticks += 1;
         if self.ticks < self.every {
             return self.contact;
@@ -108,7 +108,7 @@ impl Judge {
     }
 
     /// The torque without its bias, and whether something touches the link.
-    pub(super) fn see(
+    pub(super) fn judge(
         &mut self,
         sum: f64,
         carried: f64,
@@ -122,7 +122,7 @@ impl Judge {
         self.bias += self.follow * (sum - self.bias);
         let least = self.least.unwrap_or(TOUCH * self.largest);
         let band = least.max(SURE * uncertain.sqrt());
-        let contact = self.test.see(sum - self.bias, band, noise.sqrt());
+        let contact = self.test.update(sum - self.bias, band, noise.sqrt());
         if !contact {
             self.largest = self.largest.max(carried.abs());
         }
@@ -152,7 +152,7 @@ mod tests {
             let normal =
                 (-2.0 * uniform().max(1e-300).ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos();
             for _ in 0..test.every {
-                let now = test.see(1e-3 * normal, 0.0, 1e-3);
+                let now = test.update(1e-3 * normal, 0.0, 1e-3);
                 alarms += i32::from(now && !before);
                 before = now;
             }
@@ -164,9 +164,9 @@ mod tests {
     fn what_stays_inside_its_band_is_no_contact() {
         let mut test = ContactTest::new(1.0, 200.0, T);
         for k in 0..20_000 {
-            assert!(!test.see(0.95 * (0.001 * f64::from(k)).sin(), 1.0, 0.01));
+            assert!(!test.update(0.95 * (0.001 * f64::from(k)).sin(), 1.0, 0.01));
         }
-        assert!((0..20).any(|_| test.see(1.2, 1.0, 0.01)));
-        assert!((0..40).any(|_| !test.see(0.5, 1.0, 0.01)));
+        assert!((0..20).any(|_| test.update(1.2, 1.0, 0.01)));
+        assert!((0..40).any(|_| !test.update(0.5, 1.0, 0.01)));
     }
 }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::contact::Judge;
-use super::{External, SETTLED, Said, TINY, gravity, status};
+use super::{External, Latest, SETTLED, TINY, gravity, status};
 use crate::filters::first_order_pole;
 use crate::model::{Link, Model};
 use crate::noise::NoiseMeter;
@@ -45,8 +45,8 @@ pub struct PaperMomentum {
     last: Option<[f64; 3]>, // q, g, τ_k
     noise: NoiseMeter,
     judge: Judge,
-    /// See [`Said`].
-    pub said: Said,
+    /// See [`Latest`].
+    pub latest: Latest,
 }
 
 impl PaperMomentum {
@@ -69,14 +69,14 @@ impl PaperMomentum {
             last: None,
             noise: NoiseMeter::default(),
             judge: Judge::new(settings, settings.k_tau, period_s),
-            said: Said::nothing(),
+            latest: Latest::nothing(),
         })
     }
 
     /// Forget everything.
     pub fn reset(&mut self) {
         self.judge.reset();
-        self.said = Said::nothing();
+        self.latest = Latest::nothing();
         self.restart();
     }
 
@@ -112,7 +112,7 @@ impl PaperMomentum {
             self.momentum.last = measured.map(|velocity| self.link.inertia * velocity);
             self.damped.last = Some(self.link.damping * q);
             (self.fallen.last, self.pushed.last) = (Some(0.0), Some(0.0));
-            return self.said.carry(sample.sequence);
+            return self.latest.repeat(sample.sequence);
         };
         let velocity =
             if sample.link_velocity.is_finite() { sample.link_velocity } else { (q - before[0]) / span };
@@ -124,7 +124,7 @@ impl PaperMomentum {
         let viscous = self.damped.update(damped, pole, span);
         let weight = self.fallen.update(self.integrals[0], pole, span);
         let known = self.pushed.update(self.integrals[1], pole, span);
-        self.noise.see(p + damped + self.integrals[0] + balance, span);
+        self.noise.update(p + damped + self.integrals[0] + balance, span);
         self.unsettled -= i64::from(periods);
         let sum = internal + inertial + viscous + weight;
         let link = &self.link;
@@ -135,7 +135,7 @@ impl PaperMomentum {
         let gain = 2.0 * ((1.0 - pole) / span).powi(2) / (1.0 + pole);
         let white = gain * self.noise.variance(f64::INFINITY);
         let valid = valid && self.unsettled <= 0 && (sum + uncertain + white).is_finite();
-        let (torque, contact) = self.judge.see(sum, internal, uncertain, white, valid);
+        let (torque, contact) = self.judge.judge(sum, internal, uncertain, white, valid);
         let external = External {
             sequence: sample.sequence,
             status: if valid { status::VALID } else { 0 } | if contact { status::CONTACT } else { 0 },
@@ -144,7 +144,7 @@ impl PaperMomentum {
             link_torque: known - inertial - viscous - weight,
             difference: sum - known,
         };
-        self.said.say(external, span)
+        self.latest.publish(external, span)
     }
 }
 

@@ -12,8 +12,8 @@ impl Robust {
     pub(super) fn conclude(&mut self, sequence: u64, flags: u32) -> Estimate {
         let mut flags = flags;
         let settled = self.unsettled <= 0;
-        let parts = self.read(0.0);
-        self.sides.iter_mut().for_each(Side::act);
+        let parts = self.parts(0.0);
+        self.sides.iter_mut().for_each(Side::predict);
         for ((balance, part), torque) in self.rigid.iter_mut().zip(&parts).zip(self.last.torque) {
             balance.add(part.flexibility_torque, torque, self.period);
         }
@@ -52,14 +52,14 @@ impl Robust {
     }
 
     /// What is said where the sample cannot be used: the last estimate, for a while.
-    pub(super) fn carry(&mut self, sequence: u64, flags: u32) -> Estimate {
+    pub(super) fn hold(&mut self, sequence: u64, flags: u32) -> Estimate {
         self.rejected += 1;
-        self.external = self.momentum.as_ref().map(|momentum| momentum.said.carry(sequence));
+        self.external = self.momentum.as_ref().map(|momentum| momentum.latest.repeat(sequence));
         let since = self.rejected as f64 * self.period;
         let rejected = Some(Why::new(Reason::Rejected, None));
         let Some(last) = self.estimate else {
             self.why = rejected;
-            return joint_estimate(self.arrangement, sequence, flags, self.read(0.0), self.motors);
+            return joint_estimate(self.arrangement, sequence, flags, self.parts(0.0), self.motors);
         };
         let mut flags = flags | last.status & (status::CHANGED | status::RESTARTED);
         let was = |bit: u32| last.status & bit != 0;
@@ -67,7 +67,7 @@ impl Robust {
             self.why = rejected;
             return Estimate { sequence, status: flags, ..last };
         }
-        let parts = self.read(since);
+        let parts = self.parts(since);
         let [why, of_torque] = self.reasons(&parts, true);
         if was(status::VALID) {
             self.why = why;
@@ -103,7 +103,7 @@ impl Robust {
     }
 
     /// Each transmission's estimate, so long after the last sample.
-    fn read(&self, since_s: f64) -> [TransmissionEstimate; MOTORS] {
+    fn parts(&self, since_s: f64) -> [TransmissionEstimate; MOTORS] {
         // What has been waited for the latest channel, declared late or found to be.
         let waited = self.corrections.age_s() + self.alignment.periods.abs() * self.period;
         let behind_s = self.corrections.behind_s();

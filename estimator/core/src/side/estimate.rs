@@ -16,7 +16,7 @@ impl Side {
     #[must_use]
     pub fn estimate(&self, present: &Present, delay: f64) -> TransmissionEstimate {
         let nothing = TransmissionEstimate::NOTHING;
-        let left = || self.left(delay + present.behind_s + present.ahead_s);
+        let left = || self.balance_torque(delay + present.behind_s + present.ahead_s);
         if self.rigid {
             return TransmissionEstimate { flexibility_torque: left(), ..nothing };
         }

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from estimator.diagnosis.candidates import Candidate, columns
+from estimator.diagnosis.corrections import READINGS
 from estimator.diagnosis.frame import Corrections, Frame
-from estimator.diagnosis.readings import READINGS
 from estimator.effects import elements
 from estimator.model import Effect, JointModel
 from estimator.sample import FloatArray

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from estimator.choices import choice
-from estimator.diagnosis.base import Base
-from estimator.diagnosis.beliefs import OF_RUN, effect_std, everyday, everyday_std, least
 from estimator.diagnosis.candidates import Candidate, bounds_of, columns, reach_of, sign_smoothing, spread_of
-from estimator.diagnosis.evidence import Scale
+from estimator.diagnosis.corrections import read
 from estimator.diagnosis.frame import Corrections, Frame
-from estimator.diagnosis.readings import read
+from estimator.diagnosis.joint_priors import OF_RUN, effect_std, everyday, everyday_std, least
+from estimator.diagnosis.law_parameters import Base
+from estimator.diagnosis.regression import Scale
 from estimator.effects import STOP_EXPONENT, Coordinates
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray

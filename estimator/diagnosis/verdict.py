@@ -7,12 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from estimator.choices import choice
-from estimator.diagnosis.certainty import accounts, standing
 from estimator.diagnosis.curves import best_curve
 from estimator.diagnosis.excitation import advice_for, poor
-from estimator.diagnosis.heldout import errors_of, wider
-from estimator.diagnosis.hypothesis import Fitted
-from estimator.diagnosis.outcome import (
+from estimator.diagnosis.findings import (
     alignment_of,
     curves_of,
     findings_of,
@@ -21,6 +18,9 @@ from estimator.diagnosis.outcome import (
     stamped_wrongly,
     transmissions_of,
 )
+from estimator.diagnosis.heldout import errors_of, wider
+from estimator.diagnosis.hypothesis import Fitted
+from estimator.diagnosis.probabilities import accounts, standing
 from estimator.diagnosis.result import Diagnosis, Errors, Finding, RecordingErrors, Refitted, Verdict
 from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.stiffness import stiffness_curves

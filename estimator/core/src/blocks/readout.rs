@@ -27,7 +27,7 @@ impl Blocks {
 
     /// Torque on the motor beside the spring's that depends on no memory and no sign, N·m; `rate`: φ′.
     #[must_use]
-    pub fn rest(&self, rate: f64) -> f64 {
+    pub fn damping_and_offset(&self, rate: f64) -> f64 {
         self.posterior.as_ref().map_or(0.0, |known| known.x[RATE] * rate - known.x[OFFSET])
     }
 

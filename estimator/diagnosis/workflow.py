@@ -8,10 +8,10 @@ from estimator.choices import least_rows
 from estimator.diagnosis.bandwidth import choose_bandwidth, widest
 from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.hypothesis import Problem
-from estimator.diagnosis.judge import Judge
-from estimator.diagnosis.openorder import raised
+from estimator.diagnosis.order import raised
 from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
+from estimator.diagnosis.verdict import Judge
 from estimator.errors import EstimatorError
 from estimator.gate import check
 from estimator.model import JointModel

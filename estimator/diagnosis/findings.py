@@ -8,14 +8,14 @@ from statistics import NormalDist
 import numpy as np
 
 from estimator.choices import choice
-from estimator.diagnosis.beliefs import longest_delay_s
 from estimator.diagnosis.candidates import columns
-from estimator.diagnosis.certainty import Standing
 from estimator.diagnosis.covariance import design_effects, hac_covariance
+from estimator.diagnosis.design_matrix import curve_columns
 from estimator.diagnosis.hypothesis import Fitted, Problem
+from estimator.diagnosis.joint_priors import longest_delay_s
+from estimator.diagnosis.probabilities import Standing
 from estimator.diagnosis.result import Curve, Finding, Refitted, Rival, Series
 from estimator.diagnosis.search import Search
-from estimator.diagnosis.stack import curve_columns
 from estimator.diagnosis.stiffness import middle
 from estimator.effects import LIBRARY
 from estimator.model import ParameterValue

@@ -84,7 +84,7 @@ impl Blocks {
     }
 
     /// The window is not explained: is it the joint that has changed, or a reading?
-    pub(super) fn doubt(&mut self, odds: Odds) -> Closed {
+    pub(super) fn decide(&mut self, odds: Odds) -> Closed {
         self.doubted += 1;
         let of_joint: f64 =
             TABLE.iter().filter(|entry| entry.opens != 0).map(|e| odds.of(e.cause).probability).sum();
@@ -103,7 +103,7 @@ impl Blocks {
             // All that the window does not tell apart is open.
             let likely = odds.likely(|cause| cause.entry().opens != 0);
             let opens = TABLE.iter().zip(likely).filter(|(_, likely)| *likely).map(|(entry, _)| entry.opens);
-            self.begin(opens.fold(0, |all, one| all | one));
+            self.restart(opens.fold(0, |all, one| all | one));
             return Closed::Begun;
         }
         if self.lost && self.doubted >= FEWEST {
@@ -112,7 +112,7 @@ impl Blocks {
         }
         if self.doubted >= BLOCKS {
             // Nothing in the table, for as long as anything is remembered: another joint.
-            self.begin(set(1..UNKNOWNS));
+            self.restart(set(1..UNKNOWNS));
             return Closed::Begun;
         }
         if self.waiting.len() >= FEWEST {
@@ -122,14 +122,14 @@ impl Blocks {
     }
 
     /// What is known begins with the window: the unknowns that have changed are open again, the others are as before.
-    pub(super) fn begin(&mut self, opens: Set) {
-        self.carry(opens);
+    pub(super) fn restart(&mut self, opens: Set) {
+        self.carry_over(opens);
         self.ring.clear();
         self.peaks.clear();
         self.oldest = 0;
         for k in 0..self.waiting.len() {
             let block = self.waiting[k].clone();
-            self.keep(block);
+            self.push(block);
         }
         self.end_doubt();
         (self.doubting, self.good) = (true, CONVINCING - 1); // until another block bears it out
@@ -140,7 +140,7 @@ impl Blocks {
         self.solve();
     }
 
-    pub(super) fn carry(&mut self, opens: Set) {
+    pub(super) fn carry_over(&mut self, opens: Set) {
         let Some(posterior) = &self.posterior else { return };
         let kept = posterior.set & !opens;
         let mut x = posterior.x;
@@ -172,7 +172,7 @@ impl Blocks {
             // What was learned without a zero may be of another one: as it was before.
             self.spring.alpha[..TERMS].copy_from_slice(&carried.x[SPRING]);
         } else {
-            self.carry(1 << ZERO);
+            self.carry_over(1 << ZERO);
         }
         let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
         self.forget_rows();

@@ -275,7 +275,7 @@ impl LinkMomentum {
         }
     }
 
-    /// What is latest of a sample that was used.
+    /// What is published of a sample that was used.
     ///
     /// `valid`: whether the estimate is; `noise`: variance of q's noise, rad².
     pub fn conclude(&mut self, sequence: u64, carried: &Carried, noise: f64, valid: bool) -> External {

@@ -1,6 +1,5 @@
 """Traces a residual to a physical effect: locate, select, judge."""
 
-from estimator.diagnosis.workflow import diagnose
 from estimator.diagnosis.result import (
     Curve,
     Diagnosis,
@@ -13,6 +12,7 @@ from estimator.diagnosis.result import (
     StiffnessCurve,
     Verdict,
 )
+from estimator.diagnosis.workflow import diagnose
 
 __all__ = [
     "Curve",

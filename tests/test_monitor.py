@@ -246,7 +246,7 @@ def test_in_a_terminal_question_mark_shows_the_legend_and_q_quits(daemon):
 
 def test_a_joint_that_nobody_serves_is_not_live_and_the_nearest_is_named(daemon, capsys, monkeypatch):
     monkeypatch.setattr("drivelink.monitor.watcher.PATIENCE_S", 0.3)
-    assert cli.main(["monitor", "elbwo", "--endpoint", daemon, "--seconds", "2.2", "--json"]) == 0
+    assert cli.main(["monitor", "elbwo", "--endpoint", daemon, "--seconds", "2.2", "--json"]) == 6
     displayed = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert displayed["joint"] == "elbwo" and not displayed["live"] and "estimate" not in displayed
     assert displayed["state"] == 'no daemon of "elbwo"; did you mean "elbow"? there is elbow'

@@ -192,18 +192,17 @@ def _print(watcher: Watcher, end: float, args: argparse.Namespace, where: str) -
     """Print a line or JSON object per joint at each interval; a line only if it says something new.
 
     Raises:
-        ZenohError: no daemon is there for a while.
+        ZenohError: no daemon is there, for a while or in all the time that was asked for.
     """
-    there = time.monotonic()
+    there, seen = time.monotonic(), False
     due, said = there + args.every, {"": ""}
     while (now := time.monotonic()) < end:
         watcher.poll()
         if watcher.alive:
-            there = now
+            there, seen = now, True
         elif now - there > _ABSENT_S:
-            nobody = f"no joint at {where}: drivelink run JOINT starts a daemon"
-            hint = next((view.hint for view in watcher.views.values() if view.hint), nobody)
-            raise ZenohError(f"{hint} (waited {_ABSENT_S:g} s)")
+            seen = False
+            break
         if now >= due:
             due += args.every
             views = sorted(watcher.views.items())
@@ -217,6 +216,10 @@ def _print(watcher: Watcher, end: float, args: argparse.Namespace, where: str) -
                 print("no joint yet", flush=True)
                 said.clear()
         time.sleep(_POLL_S)
+    if not seen:
+        nobody = f"no joint at {where}: drivelink run JOINT starts a daemon"
+        hint = next((view.hint for view in watcher.views.values() if view.hint), nobody)
+        raise ZenohError(f"{hint} (waited {now - there:.0f} s)")
 
 
 def _serve(watcher: Watcher, args: argparse.Namespace, end: float, acceptance: WebAcceptance | None) -> None:

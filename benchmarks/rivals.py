@@ -186,7 +186,7 @@ class Floor:
             got = 0
             while got < len(self._formats) and source.wait(max(deadline - clock(), 0) * 1e-9):
                 since = clock()
-                for cob_id, data, _ in source.take():
+                for cob_id, data, _ in source.receive():
                     if cob_id in self._formats:
                         self._formats[cob_id].unpack_from(data)
                         got += 1

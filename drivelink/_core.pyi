@@ -327,7 +327,7 @@ class JointPipeline:
             ValueError: the bytes are of another version or kind of joint, or no snapshot.
         """
 
-    def take(self, sample: Sample, flags: int = 0, stamp_ns: int = 0, late_ns: int = 0) -> Tick:
+    def step(self, sample: Sample, flags: int = 0, stamp_ns: int = 0, late_ns: int = 0) -> Tick:
         """Take one sample as it was recorded.
 
         Args:

@@ -74,7 +74,7 @@ class FuzzBus:
     def narrow(self, cob_ids: Iterable[int]) -> None:
         pass
 
-    def take(self) -> list[CanFrame]:
+    def receive(self) -> list[CanFrame]:
         taken = [CanFrame(cob_id, data, self._stamp_ns) for cob_id, data in self._queue]
         self._queue.clear()
         self.frames += len(taken)

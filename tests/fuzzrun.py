@@ -59,7 +59,7 @@ class ForeignMaster:
     def __init__(self, bus: FuzzBus) -> None:
         self.lost_sends = 0
         self.errors: dict[str, int] = {}
-        self.take, self.wait, self.narrow = bus.take, bus.wait, bus.narrow
+        self.receive, self.wait, self.narrow = bus.receive, bus.wait, bus.narrow
 
     def send(self, cob_id: int, data: bytes) -> None:
         raise AssertionError(f"a passive daemon has sent 0x{cob_id:03X} [{data.hex(' ')}]")

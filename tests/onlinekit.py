@@ -205,7 +205,7 @@ def play(
     pipeline = JointPipeline(Assembler((), 0), estimator, model_monitor)
     rows = []
     for k, sample in enumerate(samples):
-        e = pipeline.take(sample, NODE_RESTARTED if k == restarted else 0).estimate
+        e = pipeline.step(sample, NODE_RESTARTED if k == restarted else 0).estimate
         look(k, estimator)
         rows.append((e.status, e.flexibility_torque_nm, e.stiffness_nm_rad, e.stiffness_std_nm_rad))
     status, torque, stiffness, std = np.array(rows).T

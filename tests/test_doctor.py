@@ -189,7 +189,7 @@ def test_a_bus_that_may_not_be_touched_is_judged_by_its_frames():
         for message in frames:
             syncs += message.arbitration_id == 0x80
             message.timestamp = 1e9 + 1e-3 * syncs
-            heard.take(message)
+            heard.feed(message)
         record = record_of(heard.readings(), 2, True)
         assert len(record) > 5000
         judge_record(section, heard.joint, record)

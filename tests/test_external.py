@@ -290,8 +290,8 @@ def test_a_cycle_without_a_sample_and_a_service_bit_take_its_validity(free):
     )
     tick = None
     for sample in samples({name: column[:8000] for name, column in free.items()}):
-        tick = plain.take(sample)
-        assert alarmed.take(sample).external.status == 0
+        tick = plain.step(sample)
+        assert alarmed.step(sample).external.status == 0
     assert tick.external.status & VALID and tick.external_payload is not None
     carried = plain.carry_on(8000)
     assert (carried.external.sequence, carried.external.status) == (8000, 0)

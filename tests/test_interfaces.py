@@ -166,7 +166,7 @@ def test_a_socketcand_server_that_goes_and_comes_back_and_a_second_daemon_that_i
         with pytest.raises(BusLostError, match="closed"):
             while True:  # python-can itself would say for ever that there is nothing
                 source.wait(0.01)
-                source.take()
+                source.receive()
         with served(joint):
             until(lambda: is_fresh(pipeline))
             assert not lost(daemon)
@@ -180,7 +180,7 @@ def test_error_frames_of_any_interface_are_counted_by_kind():
         source, frame = open_source(bus), {"data": b"\0\1", "is_error_frame": True, "is_extended_id": False}
         for kind in (0x040, 0x100, 0x004):
             other.send(can.Message(arbitration_id=kind, **frame))
-        assert source.take() == []
+        assert source.receive() == []
         assert source.errors == {"bus-off": 1, "restarted": 1, "controller": 1, "receive overflow": 1}
     # A lost bus is one line, whatever python-can puts into its message.
     said = "Failed to receive: [Errno 104] Connection reset by peer  Traceback (most recent call last):\n  File ...\n"

@@ -233,14 +233,14 @@ def test_the_residual_has_fallen_when_the_new_models_own_test_allows_it_in_motio
     path.write_text(f'{ELBOW.read_text()}[provenance.accepted]\ntime = "now"\n')
     new = {"provenance": {"accepted": {"time": "now"}}}
     trial = acceptance.Trial(path, 0.0)
-    assert trial.take(status(0.9, alarm=True), {"provenance": {}}, 1.0) is None and not trial.in_use
-    assert trial.take(status(0.9, alarm=True), new, 2.0) is None and trial.in_use
+    assert trial.update(status(0.9, alarm=True), {"provenance": {}}, 1.0) is None and not trial.in_use
+    assert trial.update(status(0.9, alarm=True), new, 2.0) is None and trial.in_use
     for k, residual in enumerate(residuals):
-        trial.take(status(residual, observable=observable), new, 3.0 + k)
-    trial.take(status(residuals[-1], observable=observable), new, 60.0)
+        trial.update(status(residual, observable=observable), new, 3.0 + k)
+    trial.update(status(residuals[-1], observable=observable), new, 60.0)
     assert trial.fallen is fallen and words in trial.sentence()
     never = acceptance.Trial(path, 0.0)
-    assert never.take({}, {}, 60.0) is False and "no daemon" in never.sentence()
+    assert never.update({}, {}, 60.0) is False and "no daemon" in never.sentence()
 
 
 def test_the_finding_is_published_to_views_queries_and_ros(friction, tmp_path):

@@ -55,7 +55,7 @@ class Echo:
     def wait(self, timeout_s):
         return bool(self.pending)
 
-    def take(self):
+    def receive(self):
         frames, self.pending = self.pending, []
         return frames
 

@@ -389,7 +389,7 @@ def test_sequences_and_times_without_end_allocate_nothing(last, tmp_path):
 
     def gather():
         for played in open_playback(path, JOINT, tmp_path):
-            gathered.take(played)
+            gathered.write(played)
         gathered.remarks(live=False)
 
     with little_memory():

@@ -87,9 +87,9 @@ class InRealTime:
         self._syncs = 0
         self.wait = source.wait
 
-    def take(self):
+    def receive(self):
         frames = []
-        for cob_id, data, _ in self._source.take():
+        for cob_id, data, _ in self._source.receive():
             self._syncs += cob_id == 0x080
             frames.append(CanFrame(cob_id, data, 1_700_000_000_000_000_000 + self._syncs * 1_000_000))
         return frames

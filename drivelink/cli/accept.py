@@ -82,7 +82,7 @@ def _watch(path: Path, *, quiet: bool) -> Trial:
     with subscribe(name, endpoint=zenoh.endpoint, config=source.zenoh_config, prefix=zenoh.prefix) as live:
         while trial.fallen is None:
             now_s = time.monotonic()
-            trial.take(live.status or {}, live.model or {}, now_s)
+            trial.update(live.status or {}, live.model or {}, now_s)
             if not quiet and now_s >= next_s:
                 next_s = now_s + _LINE_S
                 print(f"  {trial.sentence()}", flush=True)

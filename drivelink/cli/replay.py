@@ -24,7 +24,7 @@ from drivelink.recording.mapping import joint_of
 from drivelink.recording.outputs import EstimatesFile, Publication, Summary
 from drivelink.recording.playback import Playback, Played, open_playback
 
-Taker = Callable[[Played], None]
+Sink = Callable[[Played], None]
 
 _INTERRUPTED = 130
 _METER_EVERY = 512
@@ -83,17 +83,17 @@ def run(args: argparse.Namespace) -> int:
     begin = time.perf_counter()
     gathered = Gathered(joint, playback.period_s)
     with ExitStack() as stack:
-        takers: list[Taker] = [summary.take, gathered.take]
+        sinks: list[Sink] = [summary.write, gathered.write]
         if args.out is not None:
             linked = joint.link.dynamics is not None
             estimator = playback.pipeline.estimator
             rows = EstimatesFile(args.out, playback.motors, estimator, linked=linked, force=args.force)
             stack.callback(rows.close)
-            takers.append(rows.take)
+            sinks.append(rows.write)
         if args.publish or args.speed is not None:
             publication = _publication(args, joint, base_dir, playback, stack)
-            takers.append(publication.take)
-        interrupted = _play(playback, takers, f"replay {args.file.name}")
+            sinks.append(publication.write)
+        interrupted = _play(playback, sinks, f"replay {args.file.name}")
     took_s = time.perf_counter() - begin
     live = is_frame_log(args.file, True if args.frames else None)
     warnings = [] if args.strict or interrupted else gathered.remarks(live=live)
@@ -134,13 +134,13 @@ def _report(
         print(f"estimates: {args.out}" + (" (up to the interruption)" if interrupted else ""))
 
 
-def _play(playback: Playback, takers: Sequence[Taker], title: str) -> bool:
-    """Pass every cycle to the takers; return whether Ctrl-C ended it."""
+def _play(playback: Playback, sinks: Sequence[Sink], title: str) -> bool:
+    """Write every cycle to the sinks; return whether Ctrl-C ended it."""
     try:
         with Meter(title, playback.total) as meter:
             for count, played in enumerate(playback, 1):
-                for take in takers:
-                    take(played)
+                for write in sinks:
+                    write(played)
                 if not count % _METER_EVERY:
                     meter.update(count)
     except KeyboardInterrupt:

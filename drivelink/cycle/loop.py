@@ -173,7 +173,7 @@ class CycleLoop:
         """
         self.syncs += 1
         try:
-            frames = self.source.take()
+            frames = self.source.receive()
             self.source.send(SYNC_COB_ID, self._next_counter())
         except BusLostError as error:
             frames = []
@@ -186,7 +186,7 @@ class CycleLoop:
     def receive(self) -> None:
         """Take and process the received frames."""
         try:
-            frames = self.source.take()
+            frames = self.source.receive()
         except BusLostError as error:
             self._lose(error)
             return

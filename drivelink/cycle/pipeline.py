@@ -77,7 +77,7 @@ def rehearse(joint: JointFile) -> None:
     motors = len(joint.motor)
     for k in range(_REHEARSED):
         theta, nothing = tuple(0.01 * math.sin(0.05 * k + i) for i in range(motors)), (math.nan,) * motors
-        tick = pipeline.take(Sample(k, theta, nothing, theta, 0.0))
+        tick = pipeline.step(Sample(k, theta, nothing, theta, 0.0))
         _ = tick.estimate_payload, tick.sample_payload, tick.external_payload  # made on first access
         _ = tick.estimate, tick.sample, tick.external
     pipeline.carry_on(_REHEARSED)

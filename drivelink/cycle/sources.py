@@ -75,7 +75,7 @@ class FrameSource:
         time.sleep(max(timeout_s, 0.0))
         return False
 
-    def take(self) -> list[CanFrame]:
+    def receive(self) -> list[CanFrame]:
         """Return the received data frames with 11-bit identifiers, in order."""
         return []
 
@@ -122,7 +122,7 @@ class BusSource(FrameSource):
         self._waiting.append(message)
         return True
 
-    def take(self) -> list[CanFrame]:
+    def receive(self) -> list[CanFrame]:
         """See FrameSource."""
         messages, self._waiting = self._waiting, []
         while len(messages) < MOST_FRAMES and (message := self._receive(0.0)) is not None:
@@ -223,11 +223,11 @@ class Pumped(FrameSource):
         self.errors = source.errors
         self.wait = source.wait  # type: ignore[method-assign]
 
-    def take(self) -> list[CanFrame]:
+    def receive(self) -> list[CanFrame]:
         """See FrameSource."""
         if not self._source.waiting:
             self._devices()
-        return self._source.take()
+        return self._source.receive()
 
     def send(self, cob_id: int, data: bytes) -> None:
         """See FrameSource."""
@@ -265,7 +265,7 @@ class SocketCanSource(FrameSource):
         except (OSError, ValueError) as error:
             raise BusLostError(_reason(error)) from error
 
-    def take(self) -> list[CanFrame]:
+    def receive(self) -> list[CanFrame]:
         """See FrameSource."""
         frames: list[CanFrame] = []
         receive, buffer = self._socket.recvmsg_into, self._buffer

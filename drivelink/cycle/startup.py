@@ -148,7 +148,7 @@ class _Expected:
     def met(self) -> bool:
         return self.synced and not self._frames
 
-    def take(self, cob_id: int, data: bytes) -> None:
+    def feed(self, cob_id: int, data: bytes) -> None:
         if cob_id == SYNC_COB_ID:
             self.synced = True
         elif cob_id in self._frames and self.synced:
@@ -188,7 +188,7 @@ def _await(
     for cob_id, data, stamp_ns in _frames(port, idle, patience_s):
         if passive is not None and _overhear(passive, cob_id, data):
             expected = _Expected(expected.channel, passive.layouts.values(), expected.synced)
-        expected.take(cob_id, data)
+        expected.feed(cob_id, data)
         if cob_id == SYNC_COB_ID:
             stamps.append(stamp_ns)
         if expected.met and len(stamps) >= MEASURED_SYNCS:

@@ -112,7 +112,7 @@ class ClosedLoop(DemoRun):
         if self._asking:
             self._answer()
         if self.trial is not None and self.trial.fallen is None:
-            fallen = self.trial.take(subscription.status or {}, subscription.model or {}, time.monotonic())
+            fallen = self.trial.update(subscription.status or {}, subscription.model or {}, time.monotonic())
             if fallen is not None:
                 self._note("fallen" if fallen else "not fallen", self.trial.sentence())
                 self._end_s = min(self._end_s, time.monotonic() + _AFTERGLOW_S)

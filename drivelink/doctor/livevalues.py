@@ -86,7 +86,7 @@ class Asked:
                     data = yield Read(node, *counter.address)
                 except SdoAbort:  # some have no value before the drive runs
                     continue
-                series.values.append(counter.take(data))
+                series.values.append(counter.decode(data))
                 series.waits_s.append(clock() - before_s)
                 series.times_s.append(before_s + series.waits_s[-1] / 2)
         return {channel: series for channel, series in found.items() if 0 < len(series.values) == turns}
@@ -101,7 +101,7 @@ class _Unwrapped:
         self._last: int | None = None
         self._total = 0
 
-    def take(self, data: bytes) -> float:
+    def decode(self, data: bytes) -> float:
         """Return the SI value of the bytes."""
         data = data[: max(1, self._candidate.bits // 8)]
         count = int.from_bytes(data, "little", signed=self._candidate.signed)
@@ -136,12 +136,12 @@ class Heard:
         """Why there are no samples."""
         return self._frames.missing or "no SYNC, or not all of its frames"
 
-    def take(self, message: can.Message) -> None:
+    def feed(self, message: can.Message) -> None:
         """Take a frame, in bus order."""
         if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
             stamp_ns = round((message.timestamp or time.time()) * 1e9)
             frame = LoggedFrame(stamp_ns, message.arbitration_id, bytes(message.data), "")
-            self._keep(self._frames.take(frame))
+            self._keep(self._frames.feed(frame))
 
     def _keep(self, made: list[tuple[Sample, int]]) -> None:
         if len(self._samples) < _MOST_SAMPLES:
@@ -173,7 +173,7 @@ class Heard:
     def listen(self, bus: SilentBus, seconds: float) -> Readings:
         """Return what is heard in the next seconds."""
         self.readings()
-        listen(bus, seconds, self.take)
+        listen(bus, seconds, self.feed)
         return self.readings()
 
 

@@ -283,7 +283,7 @@ def _overhear(
     """Check a passive bus by listening."""
     configurator = PassiveConfigurator([joint], [base_dir])
     heard = Heard(joint, configurator)
-    traffic = listen(bus, seconds, heard.take)
+    traffic = listen(bus, seconds, heard.feed)
     _judge_traffic(section, traffic, joint.bus, daemons)
     for error in configurator.missing.values():
         section.error(joint.bus.channel, str(error))

@@ -161,7 +161,7 @@ class Trial:
         self._quiet = self._moved = 0
         self._last: object = None
 
-    def take(self, status: Mapping[str, Any], model: Mapping[str, Any], now_s: float) -> bool | None:
+    def update(self, status: Mapping[str, Any], model: Mapping[str, Any], now_s: float) -> bool | None:
         """Take what the daemon says now; return `fallen`."""
         if self.fallen is not None:
             return self.fallen

@@ -68,5 +68,5 @@ class WebAcceptance:
         """Return what has come of the last acceptance so far; None without one."""
         if self._trial is None:
             return None
-        fallen = self._trial.take(view.status, view.model, time.monotonic())
+        fallen = self._trial.update(view.status, view.model, time.monotonic())
         return {"fallen": fallen, "text": self._trial.sentence()}

@@ -75,7 +75,7 @@ class Gathered:
         self._most = round(_LONGEST_S / period_s)
         self._samples: list[Sample] = []
 
-    def take(self, played: Played) -> None:
+    def write(self, played: Played) -> None:
         """Add a cycle of a replay."""
         sample = played.tick.sample if len(self._samples) < self._most else None
         if sample is not None:

@@ -38,7 +38,7 @@ def estimated(cycles: Iterable[Cycle], pipeline: JointPipeline) -> Iterator[Tick
     """Pass the cycles through the pipeline; yield the output that the live loop publishes."""
     for sequence, stamp_ns, sample, flags in cycles:
         if sample is not None:
-            yield pipeline.take(sample, flags, stamp_ns)
+            yield pipeline.step(sample, flags, stamp_ns)
         elif (tick := pipeline.carry_on(sequence, flags, stamp_ns)) is not None:
             yield tick
 
@@ -197,7 +197,7 @@ class FrameSamples:
         reasons = [self._lacking, *map(str, self._listener.missing.values()), *self._listener.doubts.values()]
         return next((text for text in reasons if text), "")
 
-    def take(self, frame: LoggedFrame) -> list[tuple[Sample, int]]:
+    def feed(self, frame: LoggedFrame) -> list[tuple[Sample, int]]:
         """Take a frame; return the samples that are certain now, and the stamps of their SYNCs."""
         return self._made(self._numbering.push(frame))
 

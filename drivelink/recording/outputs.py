@@ -64,7 +64,7 @@ class EstimatesFile:
         self._rows = [",".join(columns) + "\n"]
         self._file = SafeFile(path, force=force)
 
-    def take(self, played: Played) -> None:
+    def write(self, played: Played) -> None:
         """Write one row."""
         row = _row(played, self._estimator)
         self._rows.append(self._line % (row + external_row(played.tick.external) if self._linked else row))
@@ -104,7 +104,7 @@ class Publication:
         self._status_due_s = 0.0
         self._count = 0
 
-    def take(self, played: Played) -> None:
+    def write(self, played: Played) -> None:
         """Wait until a cycle is due, and publish it."""
         if not self._count:
             self._begin_s = played.time_s
@@ -149,7 +149,7 @@ class Summary:
         self._last: Played | None = None
         self._first_s = 0.0
 
-    def take(self, played: Played) -> None:
+    def write(self, played: Played) -> None:
         """Count one cycle."""
         if not self.count:
             self._first_s = played.time_s

@@ -97,9 +97,9 @@ def open_playback(
 
 
 def _from_samples(samples: Iterable[Sample], times: list[float], pipeline: JointPipeline) -> Iterator[Played]:
-    take = pipeline.take
+    step = pipeline.step
     for time_s, sample in zip(times, samples, strict=True):
-        yield Played(time_s, take(sample, 0, round(time_s * 1e9)))
+        yield Played(time_s, step(sample, 0, round(time_s * 1e9)))
 
 
 def _after(

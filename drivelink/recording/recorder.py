@@ -76,10 +76,10 @@ class ZenohTap:
         self._heard_s = -math.inf
         key = f"{joint.zenoh.prefix}/{joint.name}"
         ring = zenoh.handlers.RingChannel
-        takers = {"sample": self._sample, "estimate": self._estimate, "external": self._external}
+        handlers = {"sample": self._sample, "estimate": self._estimate, "external": self._external}
         self._streams: list[tuple[Any, Callable[[zenoh.Sample], None]]] = [
-            (session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)), take)
-            for name, take in takers.items()
+            (session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)), handle)
+            for name, handle in handlers.items()
             if name in sink.wants
         ]
         if "snapshot" in sink.wants:
@@ -193,10 +193,10 @@ class BusTap:
             self._reopen()
         try:
             while self._source.wait(0.0):
-                for cob_id, data, stamp_ns in self._source.take():
+                for cob_id, data, stamp_ns in self._source.receive():
                     self._sink.frame(stamp_ns, cob_id, data)
                     if self._samples is not None:
-                        self._put_samples(self._samples.take(LoggedFrame(stamp_ns, cob_id, data, "")))
+                        self._put_samples(self._samples.feed(LoggedFrame(stamp_ns, cob_id, data, "")))
         except BusLostError as error:
             _LOG.error("%s: the bus is lost: %s: no frames until it is back", self._section.channel, error)
             self._source = LostSource()

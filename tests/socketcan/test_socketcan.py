@@ -59,13 +59,13 @@ def test_frames_come_in_order_with_the_kernels_stamps():
         for k in range(100):
             other.send(can.Message(arbitration_id=0x181, data=struct.pack("<q", k), is_extended_id=False))
         assert mine.wait(LIMIT_S)
-        frames = mine.take()
+        frames = mine.receive()
         assert [struct.unpack("<q", frame.data)[0] for frame in frames] == list(range(100))
         stamps = [frame.stamp_ns for frame in frames]
         assert stamps == sorted(stamps)
         assert before - 10**9 < stamps[0] < time.time_ns() + 10**9
         assert not mine.wait(0.0)
-        assert mine.take() == []
+        assert mine.receive() == []
 
 
 def test_what_is_sent_arrives_and_is_not_heard_by_oneself():
@@ -75,7 +75,7 @@ def test_what_is_sent_arrives_and_is_not_heard_by_oneself():
         first, second = other.recv(LIMIT_S), other.recv(LIMIT_S)
         assert (first.arbitration_id, bytes(first.data)) == (0x080, b"")
         assert (second.arbitration_id, bytes(second.data)) == (0x601, bytes(8))
-        assert mine.take() == []
+        assert mine.receive() == []
 
 
 def test_only_what_is_wanted_passes_the_kernels_filter():
@@ -84,7 +84,7 @@ def test_only_what_is_wanted_passes_the_kernels_filter():
         for cob_id, extended in ((0x080, False), (0x123, False), (0x181, True), (0x181, False)):
             other.send(can.Message(arbitration_id=cob_id, is_extended_id=extended))
         taken: list[int] = []  # in order: what is not wanted would stand between those two
-        until(lambda: taken.extend(frame.cob_id for frame in mine.take()) or len(taken) > 1)
+        until(lambda: taken.extend(frame.cob_id for frame in mine.receive()) or len(taken) > 1)
         assert taken == [0x080, 0x181]
 
 
@@ -94,7 +94,7 @@ def test_can_fd_frames_are_read_whole_and_extended_remote_and_error_frames_are_n
         other.send(can.Message(arbitration_id=0x181, is_remote_frame=True, is_extended_id=False))
         data, taken = bytes(range(12)), []
         other.send(can.Message(arbitration_id=0x182, data=data, is_extended_id=False, is_fd=True))
-        until(lambda: taken.extend((frame.cob_id, frame.data) for frame in mine.take()) or taken)
+        until(lambda: taken.extend((frame.cob_id, frame.data) for frame in mine.receive()) or taken)
         assert taken == [(0x182, data)]
 
 
@@ -105,7 +105,7 @@ def test_an_interface_that_goes_down_is_a_lost_bus():
             with pytest.raises(BusLostError):
                 for _ in range(50):
                     mine.send(0x080, b"")
-                    mine.take()
+                    mine.receive()
         finally:
             ip("set", "vcan1", "up")
 
@@ -145,7 +145,7 @@ def test_the_receive_buffer_holds_a_long_stall():
             other.send(can.Message(arbitration_id=0x181, data=struct.pack("<q", k), is_extended_id=False))
         got = 0
         while mine.wait(0.1):
-            got += len(mine.take())
+            got += len(mine.receive())
         assert got == 2000
         assert mine.lost_sends == 0
 
@@ -164,7 +164,7 @@ def test_python_canopens_sync_is_one_master_and_its_period_is_measured(period_s)
         end_s = time.monotonic() + LIMIT_S
         while len(stamps) < 300 and time.monotonic() < end_s:
             source.wait(0.1)
-            stamps += [frame.stamp_ns for frame in source.take() if frame.cob_id == SYNC_COB_ID]
+            stamps += [frame.stamp_ns for frame in source.receive() if frame.cob_id == SYNC_COB_ID]
     finally:
         network.sync.stop()
         network.disconnect()
@@ -190,10 +190,10 @@ def test_frames_that_the_kernel_dropped_because_nobody_read_them_are_counted():
                 other.send(
                     can.Message(arbitration_id=0x181, data=k.to_bytes(8, "little"), is_extended_id=False)
                 )
-            read = len(source.take())
+            read = len(source.receive())
             other.send(can.Message(arbitration_id=0x181, is_extended_id=False))  # collides with itself
             source.wait(LIMIT_S)
-            read += len(source.take())
+            read += len(source.receive())
         assert 0 < read < 201
         assert source.errors[OVERFLOW] == 201 - read
     finally:

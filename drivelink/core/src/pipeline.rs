@@ -139,7 +139,7 @@ impl Pipeline {
     }
 
     /// What to publish of a sample's estimate, see [`estimate`].
-    pub fn take(
+    pub fn conclude(
         &mut self,
         sample: &Sample,
         motors: usize,
@@ -293,7 +293,7 @@ mod tests {
     fn run(stiffness: f64, alarm: bool, flags: u32) -> (u32, Vec<&'static str>) {
         let mut fixed = Fixed { stiffness, alarm, told: Vec::new() };
         let results = estimate(&mut fixed, &SAMPLE, flags, 0.0).unwrap();
-        (Pipeline::default().take(&SAMPLE, 1, results, Some(9)).estimate.status, fixed.told)
+        (Pipeline::default().conclude(&SAMPLE, 1, results, Some(9)).estimate.status, fixed.told)
     }
 
     #[test]
@@ -320,7 +320,7 @@ mod tests {
         assert!(pipeline.carry_on(1, 0, None).is_none());
         let mut fixed = Fixed { stiffness: 150.0, alarm: false, told: Vec::new() };
         let results = estimate(&mut fixed, &SAMPLE, 0, 0.0).unwrap();
-        pipeline.take(&SAMPLE, 1, results, Some(9));
+        pipeline.conclude(&SAMPLE, 1, results, Some(9));
         let tick = pipeline.carry_on(6, 0, Some(10)).unwrap();
         assert_eq!((tick.estimate.sequence, tick.estimate.status, tick.stamp_ns), (6, STALE, 10));
         assert_eq!(tick.estimate.stiffness, 150.0);

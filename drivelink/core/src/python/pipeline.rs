@@ -128,7 +128,7 @@ impl JointPipeline {
             pipeline::estimate(&mut *driver, sample, flags, late_s).map_err(to_python)?
         };
         self.history.get().push(*sample, motors);
-        Ok(lock(&self.state).take(sample, motors, results, stamp_ns))
+        Ok(lock(&self.state).conclude(sample, motors, results, stamp_ns))
     }
 }
 
@@ -267,7 +267,7 @@ impl JointPipeline {
     }
 
     #[pyo3(signature = (sample, flags = 0, stamp_ns = 0, late_ns = 0))]
-    fn take(&self, sample: &Bound<'_, PyAny>, flags: u32, stamp_ns: i64, late_ns: i64) -> PyResult<Tick> {
+    fn step(&self, sample: &Bound<'_, PyAny>, flags: u32, stamp_ns: i64, late_ns: i64) -> PyResult<Tick> {
         let (sample, motors) = sample_from(sample)?;
         Ok(Tick { core: self.run(&sample, motors, flags, Some(stamp_ns), late_ns as f64 * 1e-9)? })
     }

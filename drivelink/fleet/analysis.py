@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drivelink.jointfile import JointFile, plain_parameters
+from drivelink.jointfile.apply_diagnosis import diagnosed_model
 from drivelink.output import report, sentences
+from drivelink.output.comparison import fits_json, simulated
 from estimator.batch import TransmissionFit
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.identify import identify
@@ -48,7 +50,9 @@ def analyse(
     model = joint.model()
     outcome = diagnose(record, model, validation=validation)
     outcome = replace(outcome, notes=(*remarks, *outcome.notes))
-    document = report.as_json(outcome)
+    judged = record if validation is None else validation
+    runs = simulated(judged, declared=model, found=diagnosed_model(joint, outcome))
+    document = report.as_json(outcome) | {"free_run": fits_json(runs, title.validation or title.recording)}
     shared = {
         "verdict": outcome.verdict,
         "sentence": sentences.sentence(outcome),

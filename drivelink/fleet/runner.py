@@ -28,6 +28,7 @@ from drivelink.fleet.storage import FleetError, Source, Store, fetched
 from drivelink.fleet.table import FleetTable
 from drivelink.fleet.task import Outcome, Task, broken_row, named_time, process, recorded_time
 
+_LOST = ("cancelled", "lost")  # of a future
 _AHEAD = 4  # recordings queued per worker thread
 _CONNECT_S = 10.0
 _EPOCH = datetime.fromtimestamp(0, UTC)
@@ -144,18 +145,21 @@ def _results(client: Client, tasks: Iterable[Task], shared: Any) -> Iterator[tup
     out: dict[str, Task] = {}
     finished = as_completed(loop=client.loop)
 
-    def submit(count: int) -> None:
-        for task in islice(tasks, count):
+    def submit(more: Iterable[Task]) -> None:
+        for task in more:
             future = client.submit(process, task, shared, pure=False)
             out[future.key] = task
             finished.add(future)
 
-    submit(_window(client))
+    submit(islice(tasks, _window(client)))
     for future in finished:
         task = out.pop(future.key)
+        if future.status in _LOST and client.status == "running":  # a worker died with the result
+            submit([task])
+            continue
         yield task, _outcome(future, task)
         future.release()
-        submit(max(1, _window(client) - len(out)))
+        submit(islice(tasks, max(1, _window(client) - len(out))))
 
 
 def _window(client: Client) -> int:
@@ -167,7 +171,7 @@ def _outcome(future: Any, task: Task) -> Outcome:
     if future.status == "finished":
         outcome: Outcome = future.result()
         return outcome
-    if future.status in ("cancelled", "lost"):
+    if future.status in _LOST:
         raise FleetError("the scheduler is gone; what was finished is in the table")
     error = future.exception()
     if isinstance(error, KilledWorker):

@@ -42,7 +42,7 @@ choices! {
     BRIEF_S: f64 = 0.02, "s", "of readings that are left out, stand still or make a contact", "motion goes on as it was";
     GAP_S: f64 = 0.025, "s", "longest gap that is bridged", "a motion of 3 Hz turns by half a radian";
     AHEAD_S: f64 = 0.05, "s", "over which a motion is foreseen, and unmodelled torques last", "a sixth of a period of 3 Hz";
-    SAID_S: f64 = 0.5, "s", "for which it is said what was wrong", "people read so fast";
+    SAID_S: f64 = 0.5, "s", "for which it is said what was wrong", "two status documents";
     MEAN_S: f64 = 0.3, "s", "over which mean squares of a motion are taken", "a period of a usual motion";
     NOISE_S: f64 = 2.0, "s", "over which noise, jumps and standing still are learned", "several periods of it";
     PEAK_S: f64 = 60.0, "s", "for which the largest motion and torque are remembered", "a pause is shorter";
@@ -60,7 +60,7 @@ choices! {
     HIDDEN: f64 = 8.0, "", "of the square of φ‴, over what the main filter shows", "it hides so much at its bandwidth";
     // Noise and errors of the model.
     SURE: f64 = 3.0, "standard deviations", "at which an error is one", "one in 400";
-    CLEAR: f64 = 5.0, "", "a rate over its noise that is motion", "its square teaches 25 times as much";
+    CLEAR: f64 = 5.0, "", "a rate over its noise that is motion", "noise is then a 25th of its power";
     EXACT: f64 = 3e-4, "torque", "error of a true model", "filters, sampling and rounding leave 0.03 %";
     FLOOR: f64 = 0.002, "torque", "error that no declared model gets below", "the same, and parameters as they are written";
     EARLY: f64 = 0.005, "torque", "noise of rows before any has shown it", "drives know their torque to this";
@@ -73,20 +73,20 @@ choices! {
     DRIFT: f64 = 1e-4, "1/s", "growth of a stiffness' relative deviation without motion", "temperatures change in minutes";
     DRIFTED: f64 = 0.02, "", "of that at most", "a joint does not change more by standing";
     // Doubt.
-    EVEN: f64 = 0.05, "probability", "below which another account is none", "one in twenty";
+    EVEN: f64 = 0.05, "probability", "below which another explanation does not count", "one in twenty";
     ACCUSED: f64 = 1000.0, "", "odds at which what is declared is called wrong", "one in 1000";
-    UNUSUAL: f64 = 3.0, "", "times the largest, or the mean square, that was explained", "friction comes in bursts";
+    UNUSUAL: f64 = 3.0, "", "times what was explained before, that is unusual", "friction comes in bursts";
     FAR: f64 = 10.0, "", "times what has been seen that is no measurement", "an order of magnitude";
-    REST: f64 = 0.03, "", "of what is left without a cause that explains it", "an effect that bends with the change";
+    REST: f64 = 0.03, "", "share of what is left without a cause, that the right one may leave", "an effect that bends with the change";
     // Range.
     GROWN: f64 = 1.5, "", "times the range seen that a curve is used over", "beyond it, powers say nothing";
     MARGIN: f64 = 1.1, "", "times the range seen that a law is projected on", "the next motion is a little larger";
     REACHED: f64 = 0.98, "", "of where a law ends", "its slope is finite there";
     NEAR: f64 = 0.01, "jump", "a zero that comes back so near is as it was", "jumps are whole counts";
     SLOW: f64 = 0.02, "largest velocity", "over which dry friction changes its sign, and below which nothing is learned", "Stribeck speeds are faster";
-    JUMP_RAD: f64 = 1e-3, "rad", "smallest jump of a position", "a period's motion beyond its acceleration";
-    WILD_RAD_S2: f64 = 100.0, "rad/s²", "acceleration of the bare motor that no torque surprises by", "small drives do so";
-    TAUGHT_RAD2_S2: f64 = 1e-6, "rad²/s²", "mean square of φ′ from which eq 32 learns", "a count a period is more";
+    JUMP_RAD: f64 = 1e-3, "rad", "smallest jump of a position", "acceleration moves a joint less in a period";
+    WILD_RAD_S2: f64 = 100.0, "rad/s²", "acceleration of the bare motor below which no torque is a surprise", "small drives reach it";
+    TAUGHT_RAD2_S2: f64 = 1e-6, "rad²/s²", "mean square of φ′ from which eq 32 learns", "a count of 13 bits in a second";
     ONE_WAY: f64 = 0.9, "", "mean direction of a motion that goes one way", "less than a twentieth goes back";
     // Contact.
     TOUCH: f64 = 0.05, "torque carried", "least contact, where none is declared", "what bearings take";

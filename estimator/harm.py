@@ -166,7 +166,7 @@ def _balance(declared: JointModel, written: JointModel, unseen: Sequence[Unseen]
 
 def _free_run(declared: JointModel, written: JointModel, unseen: Sequence[Unseen]) -> str | None:
     """What says that the model foresees positions and deflections worse than the declared one."""
-    squares: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    squares: tuple[list[float], list[float]] = ([], [])
     for record, since in unseen:
         part = record.rows(record.sequence >= since)
         try:
@@ -176,7 +176,7 @@ def _free_run(declared: JointModel, written: JointModel, unseen: Sequence[Unseen
         size = np.std(runs[0].measured_rad, axis=0) + _NOTHING
         for mine, run in zip(squares, runs, strict=True):
             error = np.mean((run.residual_rad / size) ** 2, axis=1)
-            mine += [np.mean(block) for block in np.array_split(error, whole("groups"))]
+            mine += [_mean(block) for block in np.array_split(error, whole("groups"))]
     figure = _Figure(*map(np.array, squares))
     if not figure.rises(choice("floor") ** 2):
         return None

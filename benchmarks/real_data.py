@@ -26,6 +26,7 @@ from drivelink import jointfile, recording
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.apply_diagnosis import diagnosed_model
 from drivelink.output import report
+from drivelink.output.comparison import simulated
 from drivelink.output.document import write
 from estimator import EstimatorSettings, ExternalStatus, LinkDynamics, Status, make_estimator
 from estimator.diagnosis import diagnose
@@ -182,19 +183,21 @@ def diagnosed(run: Run, data: Path, out: Path) -> dict[str, Any]:
     else:
         train, validation = (recording.read(data / name, joint) for name in (run.train, run.validation))
     outcome = diagnose(train, joint.model(), run.bandwidth_hz, validation)
+    models = {"declared": joint.model(), "found": diagnosed_model(joint, outcome)}
+    document = report.as_json(outcome, simulated(validation, **models), run.validation)
     sensor = None
     if run.joint == "shaft_line":
-        model, torque = diagnosed_model(joint, outcome), shaft_sensor(data, run.validation)
-        sensor = against_sensor(model, validation, torque[: len(validation)])
+        torque = shaft_sensor(data, run.validation)
+        sensor = against_sensor(models["found"], validation, torque[: len(validation)])
     folder = out / f"{run.joint}-{Path(run.train).stem}-{Path(run.validation).stem}"
     folder.mkdir(parents=True, exist_ok=True)
     title = report.Title(run.joint, Path(run.train).name, Path(run.validation).name)
-    write(folder, "report", report.as_json(outcome), report.html_page(outcome, title))
+    write(folder, "report", document, report.html_page(outcome, title))
     return {
         **run._asdict(),
         "sensor": sensor,
         "baseline_relative": baseline(train, validation, joint.model(), run.bandwidth_hz),
-        **report.as_json(outcome),
+        **document,
     }
 
 

@@ -17,7 +17,7 @@ from drivelink.jointfile import JointText, apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import as_read, diagnosed_model, floor_entry
 from drivelink.output import fitreport, plots, report, sentences
 from drivelink.output import motion as motions
-from drivelink.output.comparison import beside, fits, fits_json, simulated
+from drivelink.output.comparison import beside, fits, simulated
 from drivelink.output.document import Section, write
 from drivelink.output.numbers import Units
 from drivelink.recording.columns import parse_column_map
@@ -237,7 +237,7 @@ class Diagnosed:
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of report.json."""
-        document = report.as_json(self.documented) | {"free_run": fits_json(self.free_runs, self.judged[0])}
+        document = report.as_json(self.documented, self.free_runs, self.judged[0])
         return document if self.motion is None else document | {"motion": motions.as_json(self.motion)}
 
     def sections(self) -> list[Section]:

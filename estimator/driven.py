@@ -17,7 +17,6 @@ __all__ = ["Path", "driven"]
 _PASSES = 3  # over effects with memory in the transmission, each along the link's motion of the one before
 _NEWTON = 10
 _STEP = 1e-6  # rad
-_RESOLVED = 0.5  # radians of the fastest oscillation in a step
 
 
 class Path(NamedTuple):
@@ -103,9 +102,8 @@ def _link(joint: Bodies, rows: NDArray[np.int64]) -> tuple[FloatArray, FloatArra
     x, v = joint.state[rows[0]], np.zeros_like(joint.rate[rows[0]])
     x[:, -1] = _settled(joint, x, rows[0])
     q, rate = np.empty(rows.shape), np.empty(rows.shape)
-    period = joint.record.period_s
-    steps = int(np.ceil(period * np.sqrt(_stiffest(joint) / joint.inertia[-1]) / _RESOLVED)) or 1
-    h = period / steps
+    steps = joint.steps(driven=True)
+    h = joint.record.period_s / steps
     for k, row in enumerate(rows):
         x[:, :-1], v[:, :-1] = joint.state[row, :-1], joint.rate[row, :-1]
         q[k], rate[k] = x[:, -1], v[:, -1]
@@ -126,10 +124,3 @@ def _settled(joint: Bodies, x: FloatArray, row: NDArray[np.int64]) -> FloatArray
         slope = (joint.acceleration(more, still, row)[:, -1] - a) / _STEP
         x[:, -1] -= a / np.where(np.abs(slope) > _STEP, slope, -1.0)
     return x[:, -1]
-
-
-def _stiffest(joint: Bodies) -> float:
-    """Stiffness of all transmissions at rest, N·m/rad; sixteen times of it are a step too long."""
-    zero = np.zeros(1)
-    each = (law.both(zero, alpha)[1] for law, alpha in zip(joint.laws, joint.alphas, strict=True) if law)
-    return float(sum(np.max(np.abs(k)) for k in each))

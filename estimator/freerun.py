@@ -6,6 +6,7 @@ starts from the measured state, for a joint without position control drifts in a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -21,7 +22,7 @@ from estimator.transmissions import RIGID, TransmissionModel, transmission_model
 
 __all__ = ["Bodies", "FreeRun", "free_run", "nrmse_fit"]
 
-_SUBSTEPS = 4
+_RESOLVED = 0.1
 _SMOOTHED = 21
 _CUBIC = 3
 _STEP = 1e-6
@@ -135,6 +136,7 @@ class Bodies:
         self.time = record.time_s
         self.laws = [_law(motor.transmission) for motor in model.motors]
         self.carried = model.link is not None and self.laws[0] is None
+        self.swings = model.link is not None and not self.carried
         self.alphas = [
             law.alpha(motor.transmission.parameters) if law else np.zeros(0)
             for law, motor in zip(self.laws, model.motors, strict=True)
@@ -170,21 +172,22 @@ class Bodies:
     def names(self) -> tuple[str, ...]:
         """Names of `channels`."""
         motors = [f"motor{i + 1}_position" for i in range(self.m)]
-        link = ["link_position"] if self.model.link is not None and not self.carried else []
+        link = ["link_position"] if self.swings else []
         flexible = [f"motor{i + 1}_deflection" for i in range(self.m) if self.laws[i]]
         return (*motors, *link, *flexible)
 
     def channels(self, x: FloatArray) -> FloatArray:
         """Return the positions and deflections (n, c) of states (n, m + 1)."""
         columns = [x[:, i] for i in range(self.m)]
-        if self.model.link is not None and not self.carried:
+        if self.swings:
             columns.append(x[:, -1])
         columns += [x[:, -1] - x[:, i] for i in range(self.m) if self.laws[i]]
         return np.column_stack(columns)
 
     def run(self, rows: NDArray[np.int64]) -> FloatArray:
         """Return the (size, windows, m + 1) simulated readings of windows of rows (size, windows)."""
-        h = self.record.period_s / _SUBSTEPS
+        steps = self.steps()
+        h = self.record.period_s / steps
         x, v = self.state[rows[0]].copy(), self.rate[rows[0]].copy()
         out = np.empty((*rows.shape, self.m + 1))
         with np.errstate(all="ignore"):  # a run that leaves the world has a fit of minus infinity
@@ -192,11 +195,22 @@ class Bodies:
                 self._hold(row, x, v)
                 out[k] = x
                 out[k, :, -1] += self.reading_error(x[:, -1], v[:, -1])
-                for _ in range(_SUBSTEPS):
+                for _ in range(steps):
                     x += 0.5 * h * v
                     v += h * self._gain(x, v, row, h)
                     x += 0.5 * h * v
         return np.nan_to_num(out, nan=1e9, posinf=1e9, neginf=-1e9).clip(-1e9, 1e9)
+
+    def steps(self, *, driven: bool = False) -> int:
+        """Return steps of a period that resolve the fastest oscillation; the link's if motors are driven."""
+        stiffness = np.zeros(self.m)
+        for i, (law, alpha) in enumerate(zip(self.laws, self.alphas, strict=True)):
+            if law:
+                stiffness[i] = np.max(np.abs(law.both(self.state[:, -1] - self.state[:, i], alpha)[1]))
+        square = 0.0 if driven else float(np.max(stiffness / self.inertia[:-1]))
+        if self.swings:
+            square += float(np.sum(stiffness) / self.inertia[-1])
+        return max(1, math.ceil(self.record.period_s * math.sqrt(square) / _RESOLVED))
 
     def _hold(self, row: NDArray[np.int64], x: FloatArray, v: FloatArray) -> None:
         """Without dynamics of its own the link is where it is measured; a carried one moves with motor 1."""
@@ -207,14 +221,16 @@ class Bodies:
 
     def _gain(self, x: FloatArray, v: FloatArray, row: NDArray[np.int64], h: float) -> FloatArray:
         """Mean acceleration over a step: half implicit, fully where the damping is stiffer than the step."""
-        a = self.acceleration(x, v, row)
-        slope = np.zeros_like(a)
-        for j in range(self.m + (self.model.link is not None and not self.carried)):
-            moved = v.copy()
-            moved[:, j] += _STEP
-            slope[:, j] = (self.acceleration(x, moved, row)[:, j] - a[:, j]) / _STEP
+        bodies = np.arange(self.m + self.swings)
+        rates = np.repeat(v[None], len(bodies) + 1, axis=0)
+        rates[bodies + 1, :, bodies] += _STEP
+        same = np.tile(x, (len(rates), 1)), rates.reshape(-1, self.m + 1), np.tile(row, len(rates))
+        moved = self.acceleration(*same).reshape(rates.shape)
+        a: FloatArray = moved[0]
+        slope = np.zeros_like(v)
+        slope[:, bodies] = (moved[bodies + 1, :, bodies].T - a[:, bodies]) / _STEP
         stiff = np.minimum(slope, 0.0) * h
-        a = a / (1.0 - np.where(stiff > -1.0, 0.5, 1.0) * stiff)
+        a /= 1.0 - np.where(stiff > -1.0, 0.5, 1.0) * stiff
         if self.carried:
             a[:, -1] = a[:, 0]
         return a
@@ -232,7 +248,7 @@ class Bodies:
                 force[:, -1] -= spring
         if self.carried:
             force[:, 0] += force[:, -1]
-        if self.model.link is None or self.carried:
+        if not self.swings:
             force[:, -1] = 0.0
         return np.asarray(force / self.inertia, dtype=np.float64)
 

@@ -5,6 +5,7 @@ import signal
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # many processes would each compile every library
 
 import hypothesis
 import pytest

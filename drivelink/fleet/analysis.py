@@ -16,7 +16,7 @@ import numpy as np
 from drivelink.jointfile import JointFile, plain_parameters
 from drivelink.jointfile.apply_diagnosis import diagnosed_model
 from drivelink.output import report, sentences
-from drivelink.output.comparison import fits_json, simulated
+from drivelink.output.comparison import simulated
 from estimator.batch import TransmissionFit
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.identify import identify
@@ -52,7 +52,7 @@ def analyse(
     outcome = replace(outcome, notes=(*remarks, *outcome.notes))
     judged = record if validation is None else validation
     runs = simulated(judged, declared=model, found=diagnosed_model(joint, outcome))
-    document = report.as_json(outcome) | {"free_run": fits_json(runs, title.validation or title.recording)}
+    document = report.as_json(outcome, runs, title.validation or title.recording)
     shared = {
         "verdict": outcome.verdict,
         "sentence": sentences.sentence(outcome),

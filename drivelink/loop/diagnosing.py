@@ -24,6 +24,7 @@ from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from drivelink.loop import finding
 from drivelink.loop.finding import page_file, proposal_file
 from drivelink.output import report, sentences
+from drivelink.output.comparison import simulated
 from drivelink.output.numbers import Units
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
@@ -135,6 +136,7 @@ def make(recording: Path) -> dict[str, Any]:
         if harmful is None:
             apply_diagnosis.write(source, proposal_file(recording), change, part, recording.name, force=True)
             state = finding.PROPOSED
+    runs = simulated(held, declared=model, found=apply_diagnosis.diagnosed_model(source.joint, change))
     title = report.Title(source.joint.name, recording.name, None, source.joint.axis == "linear")
     write_whole(page_file(recording), report.html_page(outcome, title), force=True)
     sentence = f"{said.sentence} Nothing is proposed: {harmful}." if harmful else said.sentence
@@ -146,7 +148,7 @@ def make(recording: Path) -> dict[str, Any]:
         "error": error._asdict(),
         "joint_file": finding.fingerprint(source.text),
         "took_s": round(time.monotonic() - begin_s, 1),
-        "report": report.as_json(outcome),
+        "report": report.as_json(outcome, runs, recording.name),
     }
 
 

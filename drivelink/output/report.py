@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drivelink.output import plots
+from drivelink.output.comparison import fits_json
 from drivelink.output.document import (
     PARAMETER_HEAD,
     Block,
@@ -31,6 +32,7 @@ from drivelink.output.sentences import SURE, free_curve, others_of, sentence, ti
 from estimator.choices import choice
 from estimator.diagnosis import Curve, Diagnosis, Finding, StiffnessCurve
 from estimator.effects import LIBRARY
+from estimator.freerun import FreeRun
 from estimator.sample import SIGMA_95
 
 _SCHEMA = "drivelink.diagnosis/1"
@@ -63,8 +65,14 @@ class Title(NamedTuple):
     linear: bool = False
 
 
-def as_json(outcome: Diagnosis) -> dict[str, Any]:
-    """Return the content of report.json."""
+def as_json(outcome: Diagnosis, runs: Mapping[str, FreeRun], of: str) -> dict[str, Any]:
+    """Return the content of report.json.
+
+    Args:
+        outcome: the diagnosis.
+        runs: free runs of the joint as "declared" and with what was "found", where it can be simulated.
+        of: the recording that they are of.
+    """
     unlisted = free_curve(outcome)
     return {
         "schema": _SCHEMA,
@@ -84,6 +92,7 @@ def as_json(outcome: Diagnosis) -> dict[str, Any]:
         "candidates": [rival._asdict() for rival in outcome.rivals],
         "advice": list(outcome.advice),
         "notes": list(outcome.notes),
+        "free_run": fits_json(runs, of),
     }
 
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
+from scipy.optimize import nnls
 
 from estimator.choices import choice, whole
 from estimator.filters import StateVariableFilter
@@ -144,25 +144,19 @@ class Balance:
         return fit._replace(stiffness_nm_rad=fit.stiffness_nm_rad * abs(b / c))
 
     def _solve(self, a: float, b: float, c: float, rises: float, B: float, any_inertia: bool) -> Fit:
-        free, sense = (-math.inf, math.inf), math.copysign(1.0, a * b)
-        off = math.inf if any_inertia else choice("declared_factor")
-        bounds = [
-            (B / off, B * off),
-            (0.0, sense * math.inf),
-            (0.0, sense * math.inf),
-            free,
-        ]
+        sense, off = math.copysign(1.0, a * b), math.inf if any_inertia else choice("declared_factor")
+        signs = [math.copysign(1.0, B), sense, sense, 0.0]
         flexible = self.motor.flexible and self._q is not None
         ratio = a / c if flexible else a
         if ratio not in self._factors:
             self._factors[ratio] = _factors(self._columns(ratio), self._target)
         factors = self._factors[ratio]
-        pieces = slice(len(bounds), len(bounds) + whole("pieces") + 2)
+        pieces = slice(len(signs), len(signs) + whole("pieces") + 2)
         slope = deflection = 0.0
         if flexible:
-            bounds += [(0.0, -math.copysign(math.inf, rises * b * c))] * (whole("pieces") + 2)
-        bounds += [free] * (len(factors.sizes) - len(bounds))
-        x, left = _bounded(factors, np.sort(np.array(bounds), axis=1))
+            signs += [-math.copysign(1.0, rises * b * c)] * (whole("pieces") + 2)
+        signs += [0.0] * (len(factors.sizes) - len(signs))
+        x, left = _bounded(factors, signs, (abs(B) / off, abs(B) * off))
         if flexible:
             steps = -math.copysign(1.0, rises * b * c) * x[pieces]
             slope = float(np.mean(steps[: whole("pieces")]) + np.sum(steps[whole("pieces") :])) * self._unit
@@ -204,7 +198,7 @@ class Balance:
         q, theta = (self._through(x)[0] for x in (self._q, self._theta))
         nuisances = (self._acceleration, self._velocity, self._sign, self._rate, self._link_rate)
         factors = _factors([*nuisances, q, theta], self._target)
-        x, _ = _bounded(factors, np.tile((-math.inf, math.inf), (len(factors.sizes), 1)))
+        x, _ = _bounded(factors, [0.0] * len(factors.sizes))
         return float(-x[-1] / x[-2]) if x[-2] else None
 
     def _gain(self, record: Record, index: int) -> float | None:
@@ -232,8 +226,7 @@ class Balance:
         """
         position, integral = (self._through(x)[0] for x in (self._theta, np.cumsum(self._theta)))
         factors = _factors([position, integral, self._velocity, self._rate], self._target)
-        restoring, free = (-math.inf, 0.0), (-math.inf, math.inf)
-        _, left = _bounded(factors, np.array([restoring, restoring, restoring, free]))
+        _, left = _bounded(factors, (-1.0, -1.0, -1.0, 0.0))
         return np.asarray(np.hypot(left[:-1], choice("gate_floor")))
 
     @property
@@ -288,23 +281,48 @@ def _factors(columns: Sequence[FloatArray], target: FloatArray) -> _Factors:
     return _Factors(np.asarray(np.linalg.qr(every, mode="r")), sizes)
 
 
-def _bounded(factors: _Factors, bounds: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least squares with (k, 2) bounds, each band weighted by its residual.
+def _bounded(
+    factors: _Factors, signs: Sequence[float], first: tuple[float, float] = (0.0, math.inf)
+) -> tuple[FloatArray, FloatArray]:
+    """Least squares with known signs, each band weighted by its residual.
+
+    Args:
+        factors: of the balance.
+        signs: (k,) of the coefficients; 0: either.
+        first: least and largest size of the first coefficient, if it has a sign.
 
     Returns:
         (k,) coefficients; (bands + 1,) residual rms of each band and of their sum.
     """
     roots, sizes = factors
     k = len(sizes)
+    sense = np.asarray(signs)
+    order = np.argsort(np.abs(sense), kind="stable")  # any sign first: eliminated
+    free = k - np.count_nonzero(sense)
+    turned = np.where(sense[order] < 0.0, -1.0, 1.0)
     ridge = np.hstack((_RIDGE * np.eye(k), np.zeros((k, 1))))
-    limits = (bounds[:, 0] * sizes, bounds[:, 1] * sizes)
+    x = np.zeros(k)
     left = np.linalg.norm(roots[:, :, -1], axis=1)
     for _ in range(whole("rough_steps")):
         weighted = (roots[:-1] / np.hypot(left[:-1], choice("gate_floor"))[:, None, None]).reshape(-1, k + 1)
-        R = np.asarray(np.linalg.qr(np.vstack([weighted, ridge]), mode="r"))
-        x = lsq_linear(R[:k, :k], R[:k, k], limits, method="bvls").x
+        R = np.asarray(np.linalg.qr(np.vstack([weighted, ridge])[:, [*order, k]], mode="r"))
+        A, b = R[:k, :k] * turned, R[:k, k]
+        y = _nonnegative(A[free:, free:], b[free:], *(end * sizes[0] for end in first))
+        z = np.linalg.solve(A[:free, :free], b[:free] - A[:free, free:] @ y)
+        x[order] = turned * np.concatenate((z, y))
         left = np.linalg.norm(roots @ np.append(-x, 1.0), axis=1)
     return x / sizes, left
+
+
+def _nonnegative(A: FloatArray, b: FloatArray, least: float, most: float) -> FloatArray:
+    """Least squares with coefficients (k,) of at least 0, the first one from `least` to `most`."""
+    if not len(b):
+        return np.zeros(0)
+    y: FloatArray = nnls(A, b - least * A[:, 0])[0]
+    y[0] += least
+    if y[0] > most:  # the problem is convex
+        y = np.append(most, nnls(A[:, 1:], b - most * A[:, 0])[0])
+    return y
 
 
 def _gridded(record: Record, x: FloatArray) -> FloatArray:

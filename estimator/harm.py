@@ -220,12 +220,12 @@ def _on_line(
 def _replayed(model: JointModel, one: Unseen, settings: EstimatorSettings) -> FloatArray:
     """(blocks, 3) share that is valid; mean squares of what that leaves, of the external torque's error."""
     estimator = make_estimator(model, settings, one.record.period_s)
-    rows = []
+    rows, valid, known = [], int(Status.VALID), int(ExternalStatus.VALID)
     for sample in one.record.samples():
-        good = bool(estimator.step(sample).status & Status.VALID)
+        good = bool(estimator.step(sample).status & valid)
         left = estimator.residual_nm if good else math.nan
         pushed, error = estimator.external, math.nan
-        if pushed is not None and pushed.status & ExternalStatus.VALID:
+        if pushed is not None and pushed.status & known:
             error = pushed.external_torque_nm - sample.external_torque_nm
         rows.append((float(good), left**2, error**2))
     seen = np.array(rows)[one.record.sequence >= one.since]

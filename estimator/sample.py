@@ -6,9 +6,11 @@ SI units, joint side, the paper's signs: phi = q - theta, and tau_e = f(phi) act
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from enum import IntFlag
+from functools import partial
+from itertools import repeat
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -251,21 +253,20 @@ class Record:
 
     def samples(self) -> Iterator[Sample]:
         """Yield the recording tick by tick, as in the live loop."""
-        n, m = self.motor_position_rad.shape
-        nan_rows = np.full((n, m), np.nan)
-        nan_column = np.full(n, np.nan)
 
-        def column(array: FloatArray | None) -> list[float]:
-            return (nan_column if array is None else array).tolist()
+        def column(array: FloatArray | None) -> Iterable[float]:
+            return repeat(math.nan) if array is None else array.tolist()
 
-        velocity = nan_rows if self.motor_velocity_rad_s is None else self.motor_velocity_rad_s
-        yield from map(
-            Sample,
+        def rows(array: FloatArray | None) -> Iterable[tuple[float, ...]]:
+            return repeat((math.nan,) * self.motors) if array is None else zip(*array.T.tolist(), strict=True)
+
+        columns: tuple[Iterable[Any], ...] = (
             self.sequence.tolist(),
-            map(tuple, self.motor_position_rad.tolist()),
-            map(tuple, velocity.tolist()),
-            map(tuple, self.motor_torque_nm.tolist()),
+            rows(self.motor_position_rad),
+            rows(self.motor_velocity_rad_s),
+            rows(self.motor_torque_nm),
             column(self.link_position_rad),
             column(self.link_velocity_rad_s),
             column(self.external_torque_nm),
         )
+        yield from map(partial(tuple.__new__, Sample), zip(*columns, strict=False))

@@ -11,7 +11,7 @@ from estimator.model import JointModel, LinkDynamics, Motor, Transmission
 from estimator.sample import FloatArray, Record
 
 PERIOD_S = 1e-3
-SECONDS = 16.0
+SECONDS = 10.0
 PUSHES_S = (2.3, 4.1, 7.7, 9.2, 13.4)
 INERTIA, DAMPING, STIFFNESS = 0.12, 0.7, 140.0
 LINK_INERTIA, LINK_DAMPING, GRAVITY = 0.35, 0.12, 4.0

@@ -198,6 +198,16 @@ def test_a_file_is_not_written_while_its_balance_leaves_more_than_the_spring_car
     assert "more than its spring carries" in str(harm(weak, weak, [Unseen.whole(healthy)]))
 
 
+def test_a_model_that_foresees_positions_worse_is_not_written(healthy):
+    """The motors' balances know nothing of the link's inertia."""
+    law, right = Transmission(model="linear", parameters={"k_nm_rad": kit.STIFFNESS}), kit.model()
+    right = replace(right, motors=(replace(right.motors[0], transmission=law),))
+    assert right.link is not None
+    wrong = replace(right, link=replace(right.link, inertia_kg_m2=1.3 * kit.LINK_INERTIA))
+    assert "free runs over held-out data err" in str(harm(right, wrong, [Unseen.whole(healthy)]))
+    assert harm(wrong, right, [Unseen.whole(healthy)]) is None
+
+
 def test_the_last_quarter_is_judged_by_a_model_made_of_the_others(healthy):
     model, made = kit.model(), []
 

@@ -57,6 +57,7 @@ choices! {
     BRIDGED: f64 = 0.4, "rad", "that a filter turns by in a gap that is learned from", "a straight line loses 1 % of the motion";
     LATEST: f64 = 0.4, "periods", "by which a sample may be late", "half a period is another sample";
     STIFF: f64 = 0.3, "", "K T²/B above which the motor's equation is not integrated", "explicit steps are stable to 1";
+    DAMPED: f64 = 1.0, "", "(D + D_e) T/B from which it is not either", "from there on explicit steps alternate";
     HIDDEN: f64 = 8.0, "", "of the square of φ‴, over what the main filter shows", "it hides so much at its bandwidth";
     // Noise and errors of the model.
     SURE: f64 = 3.0, "standard deviations", "at which an error is one", "one in 400";

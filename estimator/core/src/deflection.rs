@@ -12,7 +12,7 @@
 //! turn out to be noisier than assumed: the state has taken up that noise already, so its covariance grows
 //! with the noise's.
 
-use crate::choices::{AHEAD_S, FAR, HIDDEN, MEAN_S, PEAK_S, PLAIN, SETTLED, SLOWEST, STIFF};
+use crate::choices::{AHEAD_S, DAMPED, FAR, HIDDEN, MEAN_S, PEAK_S, PLAIN, SETTLED, SLOWEST, STIFF};
 use serde::{Deserialize, Serialize};
 
 const STATES: usize = 5;
@@ -80,6 +80,8 @@ pub struct Tuning {
     pub inertia: f64,
     /// D likewise.
     pub damping: f64,
+    /// The transmission's likewise.
+    pub rate_damping: f64,
     /// σ; 0 where it is not known yet.
     pub stiffness: f64,
     /// rms of what the motor's equation leaves unexplained; ∞: it is not used at all.
@@ -245,8 +247,10 @@ impl DeflectionFilter {
         self.count_steps(tuning, natural);
         let mut c = tuning.stiffness.max(0.0) / self.inertia;
         let mut drift = (tuning.unmodelled / self.inertia).powi(2) * AHEAD_S;
-        if !(c * t * t < STIFF && drift < noise * w.powi(4) * 1e6) {
-            (c, drift) = (0.0, noise * w.powi(4));
+        // Where the link is held, D and the transmission's damping may be large and cancel each other.
+        let damped = (tuning.damping.abs() + tuning.rate_damping.abs()) * t / self.inertia;
+        if !(damped < DAMPED && c * t * t < STIFF && drift < noise * w.powi(4) * 1e6) {
+            (self.damping, c, drift) = (0.0, 0.0, noise * w.powi(4));
         }
         self.modelled = c > 0.0;
         self.pull = 0.5 * c * t;
@@ -335,5 +339,34 @@ mod tests {
         }
         assert!((filter.at(0.0) - (0.1 * 2.999 + 0.3 * 2.999 * 2.999)).abs() < 1e-6);
         assert!((filter.link_rate() - (0.2 + 0.1 + 0.6 * 2.999)).abs() < 1e-4);
+    }
+
+    #[test]
+    fn dampings_that_cancel_each_other_make_no_filter_unstable() {
+        let (damping, stiffness) = (28.0, 1000.0);
+        let mut filter = DeflectionFilter::new(0.0275, 0.0, 60.0, 2e-3, 0.02);
+        let tuning = Tuning {
+            jerk: 0.5,
+            motor_noise: 1e-10,
+            link_noise: 1e-10,
+            inertia: 0.0275,
+            damping: -damping,
+            rate_damping: damping,
+            stiffness,
+            unmodelled: 0.1,
+        };
+        filter.restart(0.0, 0.0);
+        let mut worst: f64 = 0.0;
+        for k in 1..5000 {
+            let theta = 0.008 * (f64::from(k) * 2e-3).sin() + 1e-5 * (f64::from(k) * 2.3).sin();
+            let acting = stiffness * filter.at(0.0) + damping * filter.rate();
+            filter.update(theta, -theta, stiffness * theta + acting);
+            if k % 10 == 0 {
+                filter.tune(&tuning);
+            }
+            worst = worst.max((filter.at(0.0) + theta).abs());
+        }
+        assert!(worst < 1e-4, "{worst}");
+        assert_eq!(filter.unsettled, 0);
     }
 }

@@ -14,7 +14,7 @@ use crate::model::Motor;
 use crate::settings::Priors;
 use crate::signals::{Channel, Excitation, Filters};
 use crate::spring::Family;
-use crate::unknowns::{DAMPING, INERTIA};
+use crate::unknowns::{DAMPING, INERTIA, RATE};
 
 /// What a period brings to every motor.
 #[derive(Clone, Copy, Debug)]
@@ -270,14 +270,16 @@ impl Side {
     /// One step of the deflection's filter; `noise`: variances of θ and q.
     pub fn tune(&mut self, link: &Channel, noise: [f64; 2]) {
         let known = self.blocks.posterior.as_ref().filter(|known| known.set >> INERTIA & 1 == 1);
-        let (inertia, damping) =
-            known.map_or((self.inertia, self.damping), |known| (known.x[INERTIA], known.x[DAMPING]));
+        let (inertia, damping, rate_damping) = known.map_or((self.inertia, self.damping, 0.0), |known| {
+            (known.x[INERTIA], known.x[DAMPING], known.x[RATE])
+        });
         self.deflection.tune(&Tuning {
             jerk: link.main[3] - self.balance.jerk(),
             motor_noise: noise[0],
             link_noise: noise[1],
             inertia: if inertia > 0.0 { inertia } else { self.inertia },
             damping,
+            rate_damping,
             stiffness: self.stiffness,
             unmodelled: if self.fits { self.blocks.unmodelled() } else { f64::INFINITY },
         });

@@ -48,11 +48,12 @@ class _Figure(NamedTuple):
     declared: FloatArray
     written: FloatArray
 
-    @property
-    def rms(self) -> tuple[float, float]:
-        """Of the blocks that have both: written, declared."""
+    def roots(self, least: float) -> tuple[float, float]:
+        """Return what `rises` compares, a root in the typical block: written, declared."""
         both = np.isfinite(self.declared + self.written)
-        return math.sqrt(np.mean(self.written[both])), math.sqrt(np.mean(self.declared[both]))
+        logs = (0.5 * np.log(each[both] + least) for each in (self.written, self.declared))
+        written, declared = (math.exp(float(np.mean(each))) for each in logs)
+        return written, declared
 
     def rises(self, least: float) -> bool:
         """Return whether the root of it rises; differences below the root of `least` are none."""
@@ -157,11 +158,12 @@ def _balance(declared: JointModel, written: JointModel, unseen: Sequence[Unseen]
     known, torque = can_monitor(declared), squares(written, "torque_nm")
     before = squares(declared, "residual_nm") if known else torque
     figure = _Figure(before, squares(written, "residual_nm"))
-    if not len(torque) or not figure.rises(choice("floor") ** 2 * float(np.mean(torque))):
+    least = choice("floor") ** 2 * float(np.mean(torque)) if len(torque) else 0.0
+    if not len(torque) or not figure.rises(least):
         return None
-    after, rms = figure.rms
+    after, before_nm = figure.roots(least)
     whose = "the declared one" if known else "no model"
-    return f"on held-out data the new model leaves {after:.3g} N·m of the torque, {whose} {rms:.3g}"
+    return f"on held-out data the new model leaves {after:.3g} N·m of the torque, {whose} {before_nm:.3g}"
 
 
 def _free_run(declared: JointModel, written: JointModel, unseen: Sequence[Unseen]) -> str | None:
@@ -180,7 +182,7 @@ def _free_run(declared: JointModel, written: JointModel, unseen: Sequence[Unseen
     figure = _Figure(*map(np.array, squares))
     if not figure.rises(choice("floor") ** 2):
         return None
-    new, old = figure.rms
+    new, old = figure.roots(choice("floor") ** 2)
     return (
         f"free runs over held-out data err by {new:.1%} of the motion with the new model, {old:.1%} with the "
         "declared one"
@@ -207,12 +209,13 @@ def _on_line(
         new, old = (f"{float(np.mean(x)):.0%}" for x in (valid.written, valid.declared))
         return f"{replayed} {new} of the new model's estimates are valid, {old} of the declared one's"
     torque = float(np.mean([np.var(one.record.motor_torque_nm) for one in unseen]))
+    least = choice("floor") ** 2 * torque
     compared = [(external, "its external torque errs by")]
     if not can_monitor(declared):  # else the balances tell: the estimator adapts to a wrong number
         compared.append((residual, "valid estimates leave"))
     for figure, what in compared:
-        if figure.rises(choice("floor") ** 2 * torque):
-            new, old = (f"{rms:.3g} N·m" for rms in figure.rms)
+        if figure.rises(least):
+            new, old = (f"{root:.3g} N·m" for root in figure.roots(least))
             return f"{replayed} {what} {new} with the new model, {old} with the declared one"
     return None
 

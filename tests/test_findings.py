@@ -59,7 +59,7 @@ def test_a_free_curve_that_raises_the_error_is_not_said_to_explain_it():
     unlisted = finding("unlisted", 1.0, coordinates=("position", "torque"))
     worse = replace(outcome(unlisted), verdict="unexplained", validation=Errors(1.0, 3.0, 0.82, 2.47))
     assert sentence(worse).endswith(
-        "what was tried over position and torque does not lower the torque balance's error on held-out data, 82.00%."
+        "what was tried over position and torque does not lower the torque balance's error on held-out data, 82.00 %."
     )
 
 

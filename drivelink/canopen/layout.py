@@ -293,7 +293,7 @@ def check_capacity(load: BusLoad, period_s: float) -> None:
     """
     if load.fraction > CAPACITY:
         raise BusError(
-            f"bus load would be {load.fraction:.0%}: {load.frames_per_s:.0f} frames/s need up to "
+            f"bus load would be {100.0 * load.fraction:.0f} %: {load.frames_per_s:.0f} frames/s need up to "
             f"{load.bits_per_s / 1000:.0f} kbit/s of {load.bitrate / 1000:.0f} kbit/s; a period of "
             f"{period_s * load.fraction / COMFORTABLE * 1000:.2g} ms (bus.period_s) or fewer drives would fit"
         )

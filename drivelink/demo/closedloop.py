@@ -22,7 +22,7 @@ from drivelink.loop import finding
 from drivelink.loop.acceptance import Proposal, Trial, accept, proposal
 from drivelink.monitor.terminal import Keys
 from drivelink.output.document import Grid, Paragraph, Rows, Section
-from drivelink.output.numbers import number, value_and_interval
+from drivelink.output.numbers import number, percent, value_and_interval
 from drivelink.pubsub.client import Subscription
 from estimator.sample import SIGMA_95, Status
 
@@ -54,7 +54,7 @@ def _softer(share: float) -> LoopCase:
     """Both coefficients of the elbow's spring fall by this share."""
     truth = {f"coefficients_nm_rad[{k}]": (1.0 - share) * value for k, value in ((1, 120.0), (2, 400.0))}
     parameters = {f"motor1_coefficient{k}_nm_rad": value for k, value in enumerate(truth.values(), 1)}
-    return LoopCase(f"the stiffness falls by {share:.0%}", (), parameters, truth)
+    return LoopCase(f"the stiffness falls by {percent(share, 0)}", (), parameters, truth)
 
 
 CASES: Mapping[str, LoopCase] = {
@@ -224,7 +224,8 @@ def closing(document: Mapping[str, Any]) -> Section:
     error = document["error"]
     if error is not None:
         before, after = (f"{number(error[f'{when}_rms_nm'], 3)} N·m" for when in ("before", "after"))
-        relative = f"{error['before_relative']:.2%} before, {error['after_relative']:.2%} after"
+        shares = (f"{percent(error[f'{when}_relative'], 2)} {when}" for when in ("before", "after"))
+        relative = ", ".join(shares)
         lines.append(f"error of the motor torque on held-out data: {relative} ({before}, {after})")
     if document["residual_ratio"] is not None:
         lines.append(f"residual after the acceptance: {number(document['residual_ratio'], 2)} × its baseline")

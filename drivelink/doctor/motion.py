@@ -15,6 +15,7 @@ from drivelink.canopen.node import NodeSurvey
 from drivelink.doctor.livevalues import Readings
 from drivelink.doctor.report import Section
 from drivelink.jointfile import JointFile
+from drivelink.output.numbers import percent
 from drivelink.recording.corrections import corrections
 from estimator.errors import EstimatorError
 from estimator.gate import Judgement, check, judge
@@ -64,16 +65,16 @@ def _report_judgement(section: Section, joint: JointFile, judgement: Judgement, 
         needed = [change for finding in judgement.findings for change in finding.changes]
         first = judgement.findings[0]
         text = ", and ".join(map(str, judgement.findings))
-        text += f": the torque balance leaves {first.left_before:.0%}, {first.left_after:.1%} put right"
+        before, after = percent(first.left_before, 0), percent(first.left_after, 1)
+        text += f": the torque balance leaves {before}, {after} put right"
         fix = "; ".join(map(str, corrections(joint, needed, live=True)))
         section.error(joint.name, text, f"in the joint file: {fix}")
     elif judgement.remark:
         fix = f"{_advice(record)}; or drivelink doctor --move"
         section.info(joint.name, judgement.remark, fix)
     else:
-        text = (
-            f"units and signs of positions and torque agree: the torque balance leaves {judgement.left:.1%}"
-        )
+        left = percent(judgement.left, 1)
+        text = f"units and signs of positions and torque agree: the torque balance leaves {left}"
         section.ok(joint.name, text)
 
 

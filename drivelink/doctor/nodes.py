@@ -40,6 +40,7 @@ from drivelink.doctor.report import Report, Section
 from drivelink.errors import BusError, DriveError, JointFileError
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.notice import Severity
+from drivelink.output.numbers import percent
 
 
 def examine_bus(
@@ -262,7 +263,7 @@ def _judge_load(section: Section, layouts: Sequence[NodeLayout], bus: BusSection
         return
     load = bus_load(layouts, bus)
     section.facts["bus_load"] = load.fraction
-    text = f"the cycle needs {load.fraction:.0%} of {bus.bitrate // 1000} kbit/s, worst case"
+    text = f"the cycle needs {percent(load.fraction, 0)} of {bus.bitrate // 1000} kbit/s, worst case"
     if load.fraction <= COMFORTABLE:
         section.ok("bus load", text)
     else:

@@ -25,7 +25,7 @@ from drivelink.loop import finding
 from drivelink.loop.finding import page_file, proposal_file
 from drivelink.output import report, sentences
 from drivelink.output.comparison import simulated
-from drivelink.output.numbers import Units
+from drivelink.output.numbers import Units, percent
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
 from estimator.diagnosis import Diagnosis, Errors, diagnose
@@ -50,7 +50,7 @@ def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
         error: of the model in use and of the proposed one, on held-out data.
     """
     units = Units(joint.axis == "linear")
-    fall = f"{error.before_relative:.2%} to {error.after_relative:.2%}"
+    fall = f"{percent(error.before_relative, 2)} to {percent(error.after_relative, 2)}"
     on = f"on held-out data the error of the {'link' if _of_link(outcome) else 'motor'} torque"
     if outcome.verdict == "effect":
         names = " and ".join(sentences.title_of(one, outcome) for one in outcome.effects)

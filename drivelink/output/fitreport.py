@@ -15,7 +15,7 @@ from drivelink.jointfile import JointFile, effect_entry, link_entry
 from drivelink.output import plots
 from drivelink.output.comparison import fits, fits_json
 from drivelink.output.document import PARAMETER_HEAD, Grid, Lines, Rows, Section, parameter_rows
-from drivelink.output.numbers import Units, bare_name, number
+from drivelink.output.numbers import Units, bare_name, number, percent
 from estimator.batch import TransmissionFit
 from estimator.freerun import FreeRun
 from estimator.identify import Identified
@@ -103,7 +103,7 @@ def sections(
     made.append(Section("", [Lines(tuple(found.notes))]))
     if len(names) > 1:
         each: Rows = [
-            (name, *(f"{left.rms_nm:.3g} {units.shown('N·m')}  {left.relative:.2%}" for left in one))
+            (name, *(f"{left.rms_nm:.3g} {units.shown('N·m')}  {percent(left.relative, 2)}" for left in one))
             for name, one in zip(names, found.recordings, strict=True)
         ]
         made.append(Section("error of the torque balance", [Grid(("recording", "fitted", "left out"), each)]))
@@ -126,7 +126,7 @@ def _balance(one: TransmissionFit, units: Units) -> str:
 
 
 def _share(one: TransmissionFit) -> str:
-    return f"{one.error_rms_nm / one.torque_rms_nm:.2%}"
+    return percent(one.error_rms_nm / one.torque_rms_nm, 2)
 
 
 def _remarks(one: TransmissionFit) -> list[str]:

@@ -27,7 +27,7 @@ from drivelink.output.document import (
     page,
     parameter_rows,
 )
-from drivelink.output.numbers import Units, in_words
+from drivelink.output.numbers import Units, in_words, percent
 from drivelink.output.sentences import SURE, free_curve, others_of, sentence, title_of, unexplained
 from estimator.choices import choice
 from estimator.diagnosis import Curve, Diagnosis, Finding, StiffnessCurve
@@ -157,13 +157,13 @@ def _errors(outcome: Diagnosis, units: Units) -> Grid:
     rows: Rows = []
     for name, one in (("training", outcome.train), ("validation", outcome.validation)):
         before, after = (
-            f"{rms:.4g} {unit}, {relative:.2%}"
+            f"{rms:.4g} {unit}, {percent(relative, 2)}"
             for rms, relative in (
                 (one.before_rms_nm, one.before_relative), (one.after_rms_nm, one.after_relative)
             )
         )  # fmt: skip
         part = one.after_rms_nm / max(one.before_rms_nm, 1e-300)
-        rows.append((name, before, after, Share(f"{part:.0%}", part)))
+        rows.append((name, before, after, Share(percent(part, 0), part)))
     named = any(finding.name != "unlisted" for finding in outcome.effects)
     after = "with the effects" if named else "with a free curve" if free_curve(outcome) else "refitted"
     return Grid(("", "as declared", after, "after / before"), rows)
@@ -202,7 +202,7 @@ def _candidates(outcome: Diagnosis) -> list[Block]:
         motor = f", motor {rival.motor + 1}" if rival.motor is not None and several else ""
         named = f"{'' if mine is None else '▶ '}{in_words(rival.name)}{motor}"
         chance = "" if not chances else f"< {choice('even'):g}" if p is None else f"{p:.2f}"
-        left = Share(f"{rival.error_relative:.2%}", rival.error_relative / most)
+        left = Share(percent(rival.error_relative, 2), rival.error_relative / most)
         rows.append((named, chance, left))
     return [
         Grid(("candidate", "probability", "error left with it alone"), rows),
@@ -214,7 +214,8 @@ def _choice_of(outcome: Diagnosis, chosen: list[float]) -> str:
     """Why the chosen candidates were chosen, where another one leaves less error alone."""
     if not chosen:
         return "None was chosen: alone or together they predict other stretches no better."
-    together = f" together; together they leave {outcome.train.after_relative:.2%}" if len(chosen) > 1 else ""
+    left = percent(outcome.train.after_relative, 2)
+    together = f" together; together they leave {left}" if len(chosen) > 1 else ""
     text = f"▶ chosen{together}."
     if outcome.rivals[0].error_relative < min(chosen):
         text += (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivelink.output.numbers import Units, in_words
+from drivelink.output.numbers import Units, in_words, percent
 from estimator.diagnosis import Curve, Diagnosis, Finding
 
 # probabilities at which an effect is missing, and at which it has a name
@@ -18,7 +18,7 @@ def sentence(outcome: Diagnosis) -> str:
     """Return the verdict in one sentence."""
     error, held = "the torque balance's error on held-out data", outcome.validation
     lower = held.after_rms_nm < held.before_rms_nm
-    fall = f"{error} falls from {held.before_relative:.2%} to {held.after_relative:.2%}"
+    fall = f"{error} falls from {percent(held.before_relative, 2)} to {percent(held.after_relative, 2)}"
     if outcome.verdict == "effect":
         return f"{lacks(outcome)}: {fall}."
     names = " and ".join(title_of(finding, outcome) for finding in outcome.effects)
@@ -30,15 +30,13 @@ def sentence(outcome: Diagnosis) -> str:
         return f"The model lacks something at the {place} that is not in the library" + (
             f", a function of {over}: with {by} {fall}."
             if lower
-            else f", and {by} over {over} does not lower {error}, {held.before_relative:.2%}."
+            else f", and {by} over {over} does not lower {error}, {percent(held.before_relative, 2)}."
         )
     if outcome.verdict == "insufficient_excitation":
         said = f" (it might be {names})" if names else ""
         return f"The motion does not reveal what could be missing{said}: record a richer one."
-    return (
-        f"The model is sufficient: what it leaves, {outcome.validation.after_relative:.2%} of the torque, "
-        "belongs to no effect."
-    )
+    left = percent(outcome.validation.after_relative, 2)
+    return f"The model is sufficient: what it leaves, {left} of the torque, belongs to no effect."
 
 
 def lacks(outcome: Diagnosis) -> str:
@@ -66,7 +64,8 @@ def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
     """Return the remaining error in one sentence."""
     unit = (units or Units(False)).shown("N·m")
     left = outcome.validation
-    text = f"{left.after_relative:.2%} of the torque ({left.after_rms_nm:.3g} {unit} rms) stays unexplained"
+    share = percent(left.after_relative, 2)
+    text = f"{share} of the torque ({left.after_rms_nm:.3g} {unit} rms) stays unexplained"
     if outcome.verdict == "unexplained":
         free = (
             "a free curve, which has no name in the library" if free_curve(outcome) else "whatever was tried"

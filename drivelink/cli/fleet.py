@@ -42,10 +42,7 @@ fleet.html and fleet.json. Recordings that are in the table are skipped: run the
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.usage = (
-        "drivelink fleet [-h] --joints DIR [options] RECORDINGS [RECORDINGS ...]\n"
-        "       drivelink fleet report DIR"
-    )
+    parser.usage = "drivelink fleet --joints DIR [options] RECORDINGS ...\n       drivelink fleet report DIR"
     parser.add_argument(
         "recordings",
         nargs="+",

@@ -43,7 +43,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--examples", type=Path, metavar="DIR", help="copy the examples into DIR, no more")
     parser.add_argument("--scan", action="store_true", help="take the nodes from what answers on the bus")
     parser.add_argument("--name", help="name of the joint")
-    parser.add_argument("--arrangement", choices=_ARRANGEMENTS, help="how the motors act on the joint")
+    parser.add_argument(
+        "--arrangement",
+        choices=_ARRANGEMENTS,
+        metavar="KIND",
+        help=f"how the motors act on the joint: {', '.join(_ARRANGEMENTS)}",
+    )
     add_number(
         parser, "--rotor-inertia", metavar="G_CM2", help="rotor inertia of each motor, g·cm² (data sheet)"
     )
@@ -55,7 +60,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="torque constant of each motor, mN·m/A, if the drive reports no torque",
     )
     add_number(parser, "--damping", least=0.0, metavar="NM_S_RAD", help="damping of each motor, joint side")
-    parser.add_argument("--model", choices=_MODELS, help="model of the transmission")
+    parser.add_argument(
+        "--model", choices=_MODELS, metavar="MODEL", help=f"model of the transmission: {', '.join(_MODELS)}"
+    )
     add_number(
         parser,
         "--node",

@@ -48,7 +48,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--no-realtime", action="store_true", help="do not ask for real-time scheduling and locked memory"
     )
     parser.add_argument(
-        "--log-level", choices=_LEVELS, default="info", help="least severe messages that go to stderr"
+        "--log-level",
+        choices=_LEVELS,
+        default="info",
+        metavar="LEVEL",
+        help=f"least severe messages that go to stderr: {', '.join(_LEVELS)}",
     )
     parser.add_argument(
         "--json",

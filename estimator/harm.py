@@ -20,6 +20,7 @@ from estimator.freerun import free_run
 from estimator.model import JointModel
 from estimator.model_monitor import can_monitor, seconds_of
 from estimator.online import make_estimator
+from estimator.reasons import percent
 from estimator.sample import ExternalStatus, FloatArray, Record, Status
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import transmission_model
@@ -182,9 +183,9 @@ def _free_run(declared: JointModel, written: JointModel, unseen: Sequence[Unseen
     figure = _Figure(*map(np.array, squares))
     if not figure.rises(choice("floor") ** 2):
         return None
-    new, old = figure.roots(choice("floor") ** 2)
+    new, old = (percent(share, 1) for share in figure.roots(choice("floor") ** 2))
     return (
-        f"free runs over held-out data err by {new:.1%} of the motion with the new model, {old:.1%} with the "
+        f"free runs over held-out data err by {new} of the motion with the new model, {old} with the "
         "declared one"
     )
 
@@ -206,7 +207,7 @@ def _on_line(
     valid, residual, external = (_Figure(*both) for both in zip(*sides, strict=True))
     replayed = "replayed over held-out data"
     if valid.falls():
-        new, old = (f"{float(np.mean(x)):.0%}" for x in (valid.written, valid.declared))
+        new, old = (percent(float(np.mean(x)), 0) for x in (valid.written, valid.declared))
         return f"{replayed} {new} of the new model's estimates are valid, {old} of the declared one's"
     torque = float(np.mean([np.var(one.record.motor_torque_nm) for one in unseen]))
     least = choice("floor") ** 2 * torque

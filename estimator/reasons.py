@@ -10,7 +10,7 @@ from estimator.sample import Status
 if TYPE_CHECKING:
     from estimator.online import Estimator
 
-__all__ = ["CHANGES", "REASONS", "reason_text", "why_not_valid"]
+__all__ = ["CHANGES", "REASONS", "percent", "reason_text", "why_not_valid"]
 
 _SERVICE = (
     (Status.STALE, "stale"),
@@ -73,6 +73,11 @@ def reason_text(
         changes=f"{words} has" if words else "the joint has",
     )
     return f"motor {motor}: {text}" if motor else text
+
+
+def percent(share: float, decimals: int) -> str:
+    """Return a share of one in per cent, with a space before the sign: "12.01 %"."""
+    return f"{100.0 * share:.{decimals}f} %"
 
 
 def why_not_valid(status: int, estimator: Estimator) -> tuple[str, str] | None:

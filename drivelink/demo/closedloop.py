@@ -22,8 +22,9 @@ from drivelink.loop import finding
 from drivelink.loop.acceptance import Proposal, Trial, accept, proposal
 from drivelink.monitor.terminal import Keys
 from drivelink.output.document import Grid, Paragraph, Rows, Section
-from drivelink.output.numbers import number, percent, value_and_interval
+from drivelink.output.numbers import number, value_and_interval
 from drivelink.pubsub.client import Subscription
+from estimator.reasons import percent
 from estimator.sample import SIGMA_95, Status
 
 AFTER_S = 10.0

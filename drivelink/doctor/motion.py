@@ -15,10 +15,10 @@ from drivelink.canopen.node import NodeSurvey
 from drivelink.doctor.livevalues import Readings
 from drivelink.doctor.report import Section
 from drivelink.jointfile import JointFile
-from drivelink.output.numbers import percent
 from drivelink.recording.corrections import corrections
 from estimator.errors import EstimatorError
 from estimator.gate import Judgement, check, judge
+from estimator.reasons import percent
 from estimator.sample import Record
 
 _WINDOW_S = 0.02  # differences over less are mostly quantisation

@@ -40,7 +40,7 @@ from drivelink.doctor.report import Report, Section
 from drivelink.errors import BusError, DriveError, JointFileError
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.notice import Severity
-from drivelink.output.numbers import percent
+from estimator.reasons import percent
 
 
 def examine_bus(

@@ -25,13 +25,14 @@ from drivelink.loop import finding
 from drivelink.loop.finding import page_file, proposal_file
 from drivelink.output import report, sentences
 from drivelink.output.comparison import simulated
-from drivelink.output.numbers import Units, percent
+from drivelink.output.numbers import Units
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
 from estimator.diagnosis import Diagnosis, Errors, diagnose
 from estimator.errors import EstimatorError
 from estimator.harm import Unseen, harm
 from estimator.model_monitor import Second, can_monitor, seconds_of
+from estimator.reasons import percent
 from estimator.sample import Record
 
 

@@ -15,11 +15,12 @@ from drivelink.jointfile import JointFile, effect_entry, link_entry
 from drivelink.output import plots
 from drivelink.output.comparison import fits, fits_json
 from drivelink.output.document import PARAMETER_HEAD, Grid, Lines, Rows, Section, parameter_rows
-from drivelink.output.numbers import Units, bare_name, number, percent
+from drivelink.output.numbers import Units, bare_name, number
 from estimator.batch import TransmissionFit
 from estimator.freerun import FreeRun
 from estimator.identify import Identified
 from estimator.model import Effect, Motor
+from estimator.reasons import percent
 from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import MODELS, RIGID
 

@@ -19,11 +19,6 @@ def number(value: float, digits: int = 4) -> str:
     return f"{value:.{max(0, min(decimals, max(digits, 4)))}f}".replace("-", "−")
 
 
-def percent(share: float, decimals: int) -> str:
-    """Return a share of one in per cent, with a space before the sign: "12.01 %"."""
-    return f"{100.0 * share:.{decimals}f} %"
-
-
 def value_and_interval(value: float, half: float | None, digits: int = 4) -> tuple[str, str]:
     """Return a value to the last digit that its interval leaves, and half its interval with two digits.
 

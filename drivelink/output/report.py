@@ -27,12 +27,13 @@ from drivelink.output.document import (
     page,
     parameter_rows,
 )
-from drivelink.output.numbers import Units, in_words, percent
+from drivelink.output.numbers import Units, in_words
 from drivelink.output.sentences import SURE, free_curve, others_of, sentence, title_of, unexplained
 from estimator.choices import choice
 from estimator.diagnosis import Curve, Diagnosis, Finding, StiffnessCurve
 from estimator.effects import LIBRARY
 from estimator.freerun import FreeRun
+from estimator.reasons import percent
 from estimator.sample import SIGMA_95
 
 _SCHEMA = "drivelink.diagnosis/1"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from drivelink.output.numbers import Units, in_words, percent
+from drivelink.output.numbers import Units, in_words
 from estimator.diagnosis import Curve, Diagnosis, Finding
+from estimator.reasons import percent
 
 # probabilities at which an effect is missing, and at which it has a name
 SURE, _LIKELY = 0.9, 0.3

@@ -26,6 +26,7 @@ from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.stiffness import stiffness_curves
 from estimator.effects import LIBRARY
 from estimator.priors import PRIORS
+from estimator.reasons import percent
 
 __all__ = ["Judge"]
 
@@ -126,7 +127,9 @@ class Judge:
         held = self.held.errors(self.found, self.found).after_relative
         left = max(self._left(self.found), held)
         if verdict == "sufficient" and left > PRIORS["effect"].std:
-            hidden = f"the model leaves {left:.0%} of the torque, and the recording hides what is missing"
+            hidden = (
+                f"the model leaves {percent(left, 0)} of the torque, and the recording hides what is missing"
+            )
             return "insufficient_excitation", [hidden]
         return verdict, []
 
@@ -223,8 +226,8 @@ class Judge:
         sides = [equation < problem.equations - 1, equation == problem.equations - 1]
         residuals = [h.regression.residual(h.posterior.x) for h in (before, after)]
         left = np.array([[np.sqrt(np.mean(r[side] ** 2)) for side in sides] for r in residuals])
-        motor, link = left[1] / np.maximum(left[0], 1e-300)
-        said = f"error after over before: {motor:.1%} in the motor's balance, {link:.1%} in the link's"
+        motor, link = (percent(float(x), 1) for x in left[1] / np.maximum(left[0], 1e-300))
+        said = f"error after over before: {motor} in the motor's balance, {link} in the link's"
         return [f"{said} (an effect at one side lowers only that side's)"]
 
     def _left(self, found: Fitted) -> float:

@@ -15,6 +15,7 @@ from estimator.gate.balance import Balance, Fit, Scales
 from estimator.gate.causes import Cause, Change, Kind, causes, scales
 from estimator.model import JointModel, Motor
 from estimator.priors import PRIORS
+from estimator.reasons import percent
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import transmission_model
 
@@ -102,10 +103,9 @@ class Judgement:
         """What is wrong or cannot be decided, in words; empty if everything is decided and right."""
         if self.findings:
             first, what = self.findings[0], ", and ".join(map(str, self.findings))
-            return (
-                f"{what}: the torque balance leaves {first.left_before:.0%} of the torque as declared, "
-                f"{first.left_after:.1%} with that put right"
-            )
+            before, after = percent(first.left_before, 0), percent(first.left_after, 1)
+            balance = f"the torque balance leaves {before} of the torque as declared"
+            return f"{what}: {balance}, {after} with that put right"
         if self.reason:
             return f"units and signs cannot be checked: {self.reason}"
         return f"this motion does not reveal {' or '.join(self.undecided)}" if self.undecided else ""
@@ -249,7 +249,9 @@ def _decided(
         if found and not blamed and odds >= _decisive():
             return Judgement(reason=_another_inertia(joint, weighed), left=after)
         if before > choice("unexplained"):
-            return Judgement(reason=f"the motion explains {1.0 - before:.0%} of the torque", left=before)
+            return Judgement(
+                reason=f"the motion explains {percent(1.0 - before, 0)} of the torque", left=before
+            )
         return Judgement(undecided=_undecided(joint, single, declared), left=before)
     even = -log_odds(choice("even"))
     alike = [

@@ -7,6 +7,7 @@ import numpy as np
 from estimator.choices import choice, whole
 from estimator.errors import EstimatorError
 from estimator.model import JointModel
+from estimator.reasons import percent
 from estimator.sample import FloatArray, Record
 
 __all__ = ["check"]
@@ -40,7 +41,7 @@ def check(record: Record, model: JointModel) -> None:
     span = int(record.sequence[-1] - record.sequence[0]) + 1
     gaps = choice("gaps")
     if span - n > gaps * span:
-        raise EstimatorError(f"{span - n} of {span} samples are missing: expected at most {gaps:.0%}")
+        raise EstimatorError(f"{span - n} of {span} samples are missing: expected at most {percent(gaps, 0)}")
     for i in range(record.motors):
         _channel(f"motor{i + 1}_position_rad", record.motor_position_rad[:, i])
         _channel(f"motor{i + 1}_torque_nm", record.motor_torque_nm[:, i])

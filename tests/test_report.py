@@ -68,6 +68,8 @@ def test_an_unlisted_effect_comes_with_its_curve(folder):
     effect = _diagnose(folder, "bump")["effects"][0]
     assert (effect["name"], effect["location"], effect["coordinates"]) == ("unlisted", "motor", ["position"])
     assert len(effect["curve"]["position"]) == len(effect["curve"]["torque_nm"]) > 100
+    page = (folder / "bump-joint.toml" / "report.html").read_text(encoding="utf-8")
+    assert "None was chosen: a free curve over position leaves less." in page
 
 
 def test_json_is_pure_and_a_page_without_a_curve_has_no_empty_section(folder, capsys):

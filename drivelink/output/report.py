@@ -214,6 +214,10 @@ def _candidates(outcome: Diagnosis) -> list[Block]:
 def _choice_of(outcome: Diagnosis, chosen: list[float]) -> str:
     """Why the chosen candidates were chosen, where another one leaves less error alone."""
     if not chosen:
+        error, curve = outcome.validation, free_curve(outcome)
+        if curve is not None and error.after_rms_nm < error.before_rms_nm:
+            over = " and ".join(map(in_words, curve.coordinates))
+            return f"None was chosen: a free curve over {over} leaves less."
         return "None was chosen: alone or together they predict other stretches no better."
     left = percent(outcome.train.after_relative, 2)
     together = f" together; together they leave {left}" if len(chosen) > 1 else ""

@@ -215,7 +215,7 @@ def several(*nodes):
 
 def test_what_the_bus_cannot_carry_and_a_node_of_two_joints_are_refused():
     slaves, joints = several(*range(1, 9))
-    with pytest.raises(BusError, match=r"bus load would be 11\d%.*kbit/s of 1000 kbit/s"):
+    with pytest.raises(BusError, match=r"bus load would be 11\d %.*kbit/s of 1000 kbit/s"):
         configure_joints(Wire(slaves), joints)
     with pytest.raises(BusError, match="node 5 is claimed by two joints"):
         configure_joints(Wire([drive()]), [joints[4], joints[4]])

@@ -157,10 +157,12 @@ def _balance(declared: JointModel, written: JointModel, unseen: Sequence[Unseen]
         return np.array([np.sum(np.square(getattr(s, name)[: len(model.motors)])) for s in seconds])
 
     known, torque = can_monitor(declared), squares(written, "torque_nm")
+    if not len(torque):
+        return None
     before = squares(declared, "residual_nm") if known else torque
     figure = _Figure(before, squares(written, "residual_nm"))
-    least = choice("floor") ** 2 * float(np.mean(torque)) if len(torque) else 0.0
-    if not len(torque) or not figure.rises(least):
+    least = choice("floor") ** 2 * float(np.mean(torque))
+    if not figure.rises(least):
         return None
     after, before_nm = figure.roots(least)
     whose = "the declared one" if known else "no model"
@@ -224,7 +226,7 @@ def _on_line(
 def _replayed(model: JointModel, one: Unseen, settings: EstimatorSettings) -> FloatArray:
     """(blocks, 3) share that is valid; mean squares of what that leaves, of the external torque's error."""
     estimator = make_estimator(model, settings, one.record.period_s)
-    rows, valid, known = [], int(Status.VALID), int(ExternalStatus.VALID)
+    rows, valid, known = [], int(Status.VALID), int(ExternalStatus.VALID)  # a flag's & costs a step
     for sample in one.record.samples():
         good = bool(estimator.step(sample).status & valid)
         left = estimator.residual_nm if good else math.nan

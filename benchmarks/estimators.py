@@ -67,6 +67,7 @@ CASES = {
     "vsa-ii from nothing": Case("vsa-ii", "vsa-ii", None),
     "vsa-ii declared right": Case("vsa-ii", "vsa-ii", None, (1.0, 1.0)),
     "vsa-ii declared 20 % off": Case("vsa-ii", "vsa-ii", None, OFF),
+    "vsa-ii as a polynomial of 3": Case("vsa-ii", "polynomial", 3),
     "exponential from nothing": Case("exponential", "exponential", None),
     "exponential declared 20 % off": Case("exponential", "exponential", None, OFF),
 }

@@ -42,6 +42,7 @@ SECTIONS = {
     "estimator_tick": Section("The estimator alone", quick="--ticks 8000"),
     "paper_table": Section("The paper's table"),
     "ensembles": Section("The estimator on random joints", quick="--joints 1", of="estimators"),
+    "long": Section("A minute of random joints", "--seconds 60", "--joints 1", of="estimators"),
     "undeclared": Section(
         "Effects that nobody declared, on an independent simulator",
         "--undeclared --seconds 30",

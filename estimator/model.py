@@ -122,7 +122,8 @@ class Transmission:
 
     Attributes:
         model: its name in `estimator.transmissions.MODELS`, or "none" for a rigid transmission.
-        order: p of eq 24 for polynomials; None: chosen from the data.
+        order: p of eq 24 for polynomials; None: chosen from the data. In robust mode evidence may
+            add powers.
         parameters: alpha, if known or fitted; empty: estimated without prior.
         covariance: (n, n) of alpha, as `fit` and `diagnose` write it, in the units of the parameters: the
             coefficients in order, or k_nm_rad and then the shape; None: not known.

@@ -11,7 +11,7 @@ import joints
 import numpy as np
 import pytest
 
-from estimator import register
+from estimator import EstimatorSettings, Status, make_estimator, register
 from estimator.transmissions import MODELS
 
 T = 1e-3
@@ -98,3 +98,22 @@ def test_an_estimate_ends_at_the_truth_however_its_spring_was_declared(model, of
 @pytest.mark.parametrize(("model", "order"), [("linear", 1), ("linear", None), ("polynomial", 2)])
 def test_an_order_alone_is_enough(model, order, noisy):
     ends(model, order, None, noisy)
+
+
+def test_powers_beyond_the_declared_order_are_found_and_named():
+    """Evidence adds them; before it does, and where it never does, the interval holds what they may change."""
+    spring = joints.polynomial(np.array([[[150.0, 1500.0, 3e5]]]))  # the fifth power is 5 % of the torque
+    plants = joints.Plants(*spring, B, D, 0.45, 0.3, 3.0)
+    tau = joints.sweep(np.random.default_rng(3), N, 1, 1, T, 8.0, 3.0)
+    noise = np.random.default_rng(5).normal(0, 0.04, (N, 1))
+    truth = joints.simulate(plants, tau, T)
+    record = joints.record(truth, 0, T, motor_counts=8192, link_bits=17, torque_noise=noise)
+    for order, longer in ((2, True), (3, False), (None, False)):
+        estimator = make_estimator(joints.joint_model(B, D, order=order), EstimatorSettings(), T)
+        out = [estimator.step(sample) for sample in record.samples()]
+        settled = [bool(one.status & Status.VALID) for one in out[3000:]]
+        off = np.abs([one.stiffness_nm_rad for one in out] - truth.sigma[:, 0, 0])[3000:][settled]
+        std = np.array([one.stiffness_std_nm_rad for one in out])[3000:][settled]
+        assert np.mean(settled) > 0.99
+        assert np.mean(off < 3.0 * std) > 0.99
+        assert ("higher_order_stiffness" in estimator.undeclared()[0]) == longer

@@ -81,8 +81,9 @@ pub struct Spring {
     pub law: Law,
     /// How many parameters it has.
     pub size: usize,
-    /// Whether the number of powers is chosen from the data.
-    pub open: bool,
+    /// How many of them there are at least: evidence adds powers to a polynomial.
+    pub least: usize,
+    ordered: bool, // how many powers there are is declared
     /// Whether `alpha` is of any meaning.
     pub known: bool,
     /// α.
@@ -112,13 +113,12 @@ impl Spring {
             alpha[0] = 1.0;
             law.shapes().iter().zip(&mut alpha[1..]).for_each(|(shape, value)| *value = shape.start);
         }
-        let (size, open) = match law {
-            Law::Linear => (1, false),
-            Law::Polynomial if n > 0 => (order.unwrap_or(n).clamp(n, TERMS), false),
-            Law::Polynomial => (order.unwrap_or(TERMS).min(TERMS), order.is_none()),
-            _ => (1 + law.shapes().len(), false),
+        let (least, size) = match law {
+            Law::Linear => (1, 1),
+            Law::Polynomial => (order.unwrap_or(1).max(n).min(TERMS), TERMS),
+            _ => (1 + law.shapes().len(), 1 + law.shapes().len()),
         };
-        let covariance = written.filter(|_| n == size && n == given.len()).map(|rows| {
+        let covariance = written.filter(|_| n == least && n == given.len()).map(|rows| {
             let mut covariance = [[0.0; UNKNOWNS]; UNKNOWNS];
             for (i, row) in rows.chunks_exact(n).enumerate() {
                 covariance[SPRING.start + i][SPRING.start..SPRING.start + n].copy_from_slice(row);
@@ -129,7 +129,8 @@ impl Spring {
         Spring {
             law,
             size,
-            open,
+            least,
+            ordered: n > 0 || order.is_some(),
             known: declared,
             alpha,
             zero: 0.0,
@@ -154,6 +155,12 @@ impl Spring {
     #[must_use]
     pub fn is_anchored(&self) -> bool {
         self.anchored
+    }
+
+    /// Whether these unknowns hold more powers than are declared.
+    #[must_use]
+    pub fn is_longer(&self, of: Set) -> bool {
+        self.ordered && of & set(SPRING.start + self.least..SPRING.end) != 0
     }
 
     /// α of this law alone.
@@ -207,7 +214,7 @@ impl Spring {
     #[must_use]
     pub fn declared_posterior(&self) -> Option<Posterior> {
         let covariance = self.covariance.filter(|_| self.anchored)?;
-        let known = set(SPRING.start..SPRING.start + self.size);
+        let known = set(SPRING.start..SPRING.start + self.least);
         Some(Posterior { set: known, x: [0.0; UNKNOWNS], covariance, log_evidence: 0.0 })
     }
 
@@ -344,7 +351,9 @@ impl Spring {
         let shapes = self.law.shapes();
         for (i, unknown) in SPRING.enumerate().take(self.size) {
             mean[unknown] = if self.anchored { self.start[i] - base[i] } else { 0.0 };
+            let undeclared = self.ordered && i >= self.least;
             std[unknown] = match (self.anchored, i.checked_sub(1).and_then(|k| shapes.get(k))) {
+                _ if undeclared => priors.undeclared * torque / rms(unknown),
                 (true, Some(shape)) => priors.law * (self.start[i] - shape.low),
                 (true, None) if self.start[i] != 0.0 => priors.law * self.start[i].abs(),
                 (false, Some(shape)) => (2.0 * (self.alpha[i] - shape.low)).max(1.0 / deflection),
@@ -355,9 +364,9 @@ impl Spring {
         std[LATE] = priors.encoder_delay * period_s;
         let mut prior = Prior::independent(mean, &std);
         if let Some(covariance) = self.covariance.filter(|_| self.anchored) {
-            let known = set(SPRING.start..SPRING.start + self.size);
+            let known = set(SPRING.start..SPRING.start + self.least);
             let precision = inverse(&covariance, known);
-            for i in SPRING.take(self.size) {
+            for i in SPRING.take(self.least) {
                 prior.precision[i] = precision[i];
             }
         }

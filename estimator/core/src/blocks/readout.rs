@@ -72,6 +72,7 @@ impl Blocks {
     pub fn undeclared(&self) -> impl Iterator<Item = &'static str> {
         let chosen = self.posterior.as_ref().map_or(0, |posterior| posterior.set);
         let named = CANDIDATES.iter().filter(move |c| chosen & set(c.unknowns.clone()) != 0).map(|c| c.name);
-        named.chain(self.moved.then_some("deflection_offset"))
+        let longer = self.spring.is_longer(chosen).then_some("higher_order_stiffness");
+        named.chain(longer).chain(self.moved.then_some("deflection_offset"))
     }
 }

@@ -191,7 +191,7 @@ impl Blocks {
             }
             self.friction = frame.rms(&total, &chosen, set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS));
             let omitted = self.omitted(&frame, &reduced, &total, &chosen, &used, noise);
-            self.widen(&frame, &mut chosen, &used, noise, own, &total);
+            self.widen(&frame, &mut chosen, &used, noise, own);
             let entries = chosen.covariance.iter_mut().flatten().zip(omitted.iter().flatten());
             entries.for_each(|(v, more)| *v += more);
             self.torque = self.spring.torque_rms(&projection, &total);
@@ -247,11 +247,10 @@ impl Blocks {
         for (group, candidate) in groups.iter_mut().zip(&CANDIDATES) {
             *group = set(candidate.unknowns.clone());
         }
-        if self.spring.open {
-            base &= !set(SPRING.start + 1..SPRING.end);
-            for (group, more) in groups[CANDIDATES.len()..].iter_mut().zip(2..=self.spring.size) {
-                *group = set(SPRING.start..SPRING.start + more);
-            }
+        let (least, size) = (self.spring.least, self.spring.size);
+        base &= !set(SPRING.start + least..SPRING.end);
+        for (group, more) in groups[CANDIDATES.len()..].iter_mut().zip(least + 1..=size) {
+            *group = set(SPRING.start..SPRING.start + more);
         }
         (base, groups)
     }
@@ -303,7 +302,9 @@ impl Blocks {
         let left_out = groups.iter().filter(|group| *group & !chosen.set & frame.set != 0);
         let rivals = left_out.map(|group| (chosen.set | group, prior)).chain([(chosen.set, &elsewhere)]);
         for (set, prior) in rivals {
-            let odds = (log_evidence(reduced, set, prior, noise) - chosen.log_evidence).exp() / many;
+            // An effect is as rare as there are many; that a series goes on where it is cut off is as likely as not.
+            let usual = if set & !chosen.set & self::set(SPRING) == 0 { many.recip() } else { 1.0 };
+            let odds = usual * (log_evidence(reduced, set, prior, noise) - chosen.log_evidence).exp();
             let probability = odds / (1.0 + odds);
             if probability < EVEN {
                 continue;
@@ -320,21 +321,14 @@ impl Blocks {
     }
 
     /// What the chosen unknowns leave beyond the noise is an error of the model: scores of blocks hold it.
-    fn widen(
-        &mut self,
-        frame: &Frame,
-        chosen: &mut Posterior,
-        prior: &Prior,
-        noise: f64,
-        own: f64,
-        total: &Gram,
-    ) {
+    fn widen(&mut self, frame: &Frame, chosen: &mut Posterior, prior: &Prior, noise: f64, own: f64) {
         let residual = self.residual;
         self.score(frame, &residual, chosen.set);
         // What no noise explains is an effect that is missing: what it does to a block is in the blocks' scores, what it
-        // does to all of them alike is not.
-        let (rounded, unlike) = (EXACT * total.rms(balance::TORQUE), UNLIKE * self.friction);
-        let missing = (own - self.white - rounded * rounded).max(0.0) + unlike * unlike;
+        // does to all of them alike is not. Nor is rounding, where the readings have too little noise to spread it.
+        let (rounded, unlike) = (EXACT * EXACT * self.fluctuation, UNLIKE * self.friction);
+        let bare = (rounded - self.white).max(0.0);
+        let missing = (own - self.white - rounded).max(0.0) + bare + unlike * unlike;
         let by_prior = by_prior(chosen, prior);
         let blocks = self.ring.len() as f64;
         let clustered =

@@ -24,7 +24,7 @@ from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
-from estimator.gate import check
+from estimator.gate import check, without_hold
 from estimator.model import HIGHEST_ORDER, JointModel, ParameterValue, Transmission
 from estimator.sample import SIGMA_95, FloatArray, Record
 from estimator.transmissions import MODELS, RIGID, UNKNOWN, TransmissionModel
@@ -173,6 +173,7 @@ def fit_joint(
     usable = [_whole(one, model) for one in records]
     for one in usable:
         check(one, model)
+    model = without_hold(usable, model)
     if bandwidth_rad_s is None:
         bandwidth_hz = choose_bandwidth(usable, model)
     else:

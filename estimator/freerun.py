@@ -16,6 +16,7 @@ from scipy.signal import savgol_filter
 
 from estimator.effects import Coordinates, EffectType, elements
 from estimator.errors import EstimatorError
+from estimator.gate import without_hold
 from estimator.model import Effect, JointModel, Transmission
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import RIGID, TransmissionModel, transmission_model
@@ -71,7 +72,8 @@ def free_run(record: Record, model: JointModel, horizon_s: float | None = None) 
     """Simulate a model under the motor torque of a recording.
 
     The integrator splits position and velocity (second order); where damping or dry friction is stiffer than
-    the step, velocity is implicit. Without link dynamics the measured link drives the transmissions.
+    the step, velocity is implicit. Without link dynamics, or with the link held, the measured link drives the
+    transmissions.
 
     Args:
         record: without gaps, or with gaps that are left out: windows with one are not simulated.
@@ -82,6 +84,7 @@ def free_run(record: Record, model: JointModel, horizon_s: float | None = None) 
     Raises:
         EstimatorError: a transmission has no parameters, or no window fits into the recording.
     """
+    model = without_hold([record], model)
     if horizon_s is not None:
         return _windows(record, model, horizon_s)
     horizon = 5.0

@@ -94,7 +94,7 @@ def identify(
     link_effects = model.link_effects
     if all(one.excited for motor, one in zip(model.motors, fits, strict=True) if motor.flexible):
         link_effects = _effects(joint, link_effects, None, notes)
-    found = replace(model, motors=motors, link=link, link_effects=link_effects)
+    found = replace(model, motors=motors, link=link or model.link, link_effects=link_effects)
     return Identified(
         fits=fits,
         model=found,

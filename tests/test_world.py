@@ -2,13 +2,24 @@
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import joints
 import numpy as np
 import pytest
 
-from estimator import EstimatorSettings, JointModel, Motor, Record, Status, Transmission, make_estimator
+from estimator import (
+    EstimatorSettings,
+    JointModel,
+    LinkDynamics,
+    Motor,
+    Record,
+    Status,
+    Transmission,
+    fit,
+    make_estimator,
+)
 from estimator.diagnosis import diagnose
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -121,3 +132,26 @@ def test_a_stiff_joint_that_moves_fast_is_not_taken_for_a_soft_one_with_a_late_l
     # Noise of the encoders leaves a percent; a spring that holds the delay has a fiftieth of it.
     assert np.all(np.abs(stiffness[-250:] / 7.6e6 - 1.0) < 0.05)
     assert np.all(np.abs(stiffness[valid] / 7.6e6 - 1.0) < 0.2)
+
+
+HELD = "spring=cubic stiffness=120 cubic=3600 seconds=12 size=7 link_bits=17"
+ELASTIC = Motor(
+    inertia_kg_m2=0.12, viscous_damping_nm_s_rad=0.8, transmission=Transmission(model="polynomial", order=2)
+)
+
+
+@pytest.mark.parametrize("dynamics", [None, LinkDynamics(inertia_kg_m2=0.4, gravity_nm=3.0)])
+def test_a_link_that_is_held_shows_the_spring_and_nothing_of_the_link(dynamics):
+    record = simulated(f"{HELD} link_inertia=1e7 gravity=0").record
+    assert len(np.unique(record.link_position_rad)) < 4
+    joint = JointModel(arrangement="single", motors=(ELASTIC,), link=dynamics)
+    (found,) = fit(record, joint)
+    assert np.all(np.abs(found.alpha - [120.0, 3600.0]) < 3.0 * np.sqrt(np.diag(found.covariance)))
+    assert diagnose(record, joint).verdict == "sufficient"
+
+
+def test_a_link_encoder_that_is_silent_shows_no_spring():
+    moving = simulated(f"{HELD} gravity=3").record
+    silent = replace(moving, link_position_rad=np.full(len(moving), 0.3))
+    (found,) = fit(silent, JointModel(arrangement="single", motors=(ELASTIC,)))
+    assert not found.parameters

@@ -16,11 +16,15 @@ from drivelink.recording.columns import record_of_samples
 from drivelink.recording.limits import MAX_SAMPLES
 from drivelink.recording.playback import Played
 from estimator.errors import EstimatorError
-from estimator.gate import Change, Discrepancy, Judgement, check, judge
+from estimator.gate import Change, Discrepancy, Judgement, check, is_held, judge
 from estimator.model import JointModel
 from estimator.sample import Record, Sample
 
 _ON_THE_BUS = (".drive", ".encoder")
+_HELD = (
+    "the link position does not change: the link is taken to be held, and its dynamics are left out; "
+    "if it moves, its encoder is silent"
+)
 _LONGEST_S = 60.0  # of a run that is examined; more adds no information
 
 
@@ -43,7 +47,7 @@ def gate(path: Path, joint: JointFile, record: Record, *, strict: bool) -> list[
     """Check units, signs, gears and time of a recording against the joint as declared.
 
     Returns:
-        What is wrong, with the line to paste, or what the motion does not reveal; empty or one line.
+        What is wrong, with the line to paste, or what the motion does not reveal, and that the link is held.
 
     Raises:
         RecordingError: strict, and something is wrong.
@@ -57,7 +61,8 @@ def gate(path: Path, joint: JointFile, record: Record, *, strict: bool) -> list[
     line = _line(joint, judgement, live=is_frame_log(path))
     if strict and judgement.findings:
         raise RecordingError(f"{path}: {line}")
-    return [line] if line else []
+    held = _HELD if is_held(record, model) else ""
+    return [said for said in (line, held) if said]
 
 
 def _line(joint: JointFile, judgement: Judgement, *, live: bool) -> str:

@@ -13,7 +13,7 @@ from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.verdict import Judge
 from estimator.errors import EstimatorError
-from estimator.gate import check
+from estimator.gate import check, without_hold
 from estimator.model import JointModel
 from estimator.sample import Record
 
@@ -48,6 +48,7 @@ def diagnose(
     everything = records + ([] if validation is None else [validation])
     for one in everything:
         check(one, model)
+    model = without_hold(everything, model)
     progress("bandwidth")
     bandwidth = bandwidth_hz or choose_bandwidth(records, model)
     most = widest(max(r.period_s for r in records))

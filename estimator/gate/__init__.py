@@ -4,6 +4,16 @@ from __future__ import annotations
 
 from estimator.gate.causes import Change, Kind
 from estimator.gate.decision import Discrepancy, Judgement, examine, judge
-from estimator.gate.usable import check
+from estimator.gate.usable import check, is_held, without_hold
 
-__all__ = ["Change", "Discrepancy", "Judgement", "Kind", "check", "examine", "judge"]
+__all__ = [
+    "Change",
+    "Discrepancy",
+    "Judgement",
+    "Kind",
+    "check",
+    "examine",
+    "is_held",
+    "judge",
+    "without_hold",
+]

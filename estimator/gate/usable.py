@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from estimator.choices import choice, whole
@@ -10,7 +13,7 @@ from estimator.model import JointModel
 from estimator.reasons import percent
 from estimator.sample import FloatArray, Record
 
-__all__ = ["check"]
+__all__ = ["check", "is_held", "without_hold"]
 
 _ABSURD = 1.0 / np.finfo(float).eps  # where numbers are no longer told apart by one unit
 
@@ -46,7 +49,7 @@ def check(record: Record, model: JointModel) -> None:
         _channel(f"motor{i + 1}_position_rad", record.motor_position_rad[:, i])
         _channel(f"motor{i + 1}_torque_nm", record.motor_torque_nm[:, i])
     if record.link_position_rad is not None and model.has_deflection:
-        _channel("link_position_rad", record.link_position_rad)
+        _finite("link_position_rad", record.link_position_rad)
     if record.external_torque_nm is not None:
         _finite("external_torque_nm", record.external_torque_nm)
 
@@ -65,6 +68,23 @@ def _channel(name: str, x: FloatArray) -> None:
         raise EstimatorError(
             f"{name} is constant ({x[0]:g}): the joint stands still, or its sensor is silent"
         )
-    still = np.count_nonzero(np.diff(x) == 0.0) / (len(x) - 1)
-    if still > 0.995 and len(np.unique(x)) < 4:
+    if _stands(x):
         raise EstimatorError(f"{name} hardly changes: only {len(np.unique(x))} different values")
+
+
+def _stands(x: FloatArray) -> bool:
+    """Whether a reading stays within a few counts, and on one of them nearly always."""
+    still = np.count_nonzero(np.diff(x) == 0.0) / (len(x) - 1)
+    return bool(still > 0.995 and len(np.unique(x)) < 4)
+
+
+def is_held(record: Record, model: JointModel) -> bool:
+    """Whether the link stands still: then the motor's spring ends at a fixed point."""
+    link = record.link_position_rad
+    return model.has_deflection and link is not None and _stands(link)
+
+
+def without_hold(records: Sequence[Record], model: JointModel) -> JointModel:
+    """The model without the link's balance, where a torque that is not measured holds the link."""
+    held = any(is_held(one, model) and one.external_torque_nm is None for one in records)
+    return replace(model, link=None) if held else model

@@ -11,68 +11,68 @@ use crate::suspicion;
 impl Robust {
     pub(super) fn conclude(&mut self, sequence: u64, flags: u32) -> Estimate {
         let mut flags = flags;
-        let settled = self.unsettled <= 0;
+        let settled = self.live.unsettled <= 0;
         let parts = self.parts(0.0);
         self.sides.iter_mut().for_each(Side::predict);
-        for ((balance, part), torque) in self.rigid.iter_mut().zip(&parts).zip(self.last.torque) {
+        for ((balance, part), torque) in self.rigid.iter_mut().zip(&parts).zip(self.live.last.torque) {
             balance.add(part.flexibility_torque, torque, self.period);
         }
         let [why, of_torque] = self.reasons(&parts, settled);
-        let repeats = self.refused.is_some_and(|(what, _)| what.reason == suspicion::Reason::Frozen);
+        let repeats = self.live.refused.is_some_and(|(what, _)| what.reason == suspicion::Reason::Frozen);
         let rejected =
             (repeats || flags & status::INPUT_REJECTED != 0).then(|| Why::new(Reason::Rejected, None));
-        self.why = rejected.or(why);
+        self.live.why = rejected.or(why);
         if rejected.or(of_torque).is_none() {
             flags |= status::TORQUE_VALID;
         }
         if self.sides.iter().any(Side::has_changed) {
             flags |= status::CHANGED;
         }
-        if self.why.is_none() {
+        if self.live.why.is_none() {
             flags |= status::VALID;
             let excited = |side: &Side| side.rigid || side.excited;
             if settled && self.flexible && self.sides.iter().all(excited) {
                 flags |= status::OBSERVABLE;
             }
         }
-        if self.said > 0 {
-            self.said -= 1;
+        if self.live.said > 0 {
+            self.live.said -= 1;
             flags |= status::RESTARTED;
         }
         if self.momentum.is_some() {
             let valid = flags & status::VALID != 0;
-            let carried = self.carried(&self.last.present).unwrap_or_default();
+            let carried = self.carried(&self.live.last.present).unwrap_or_default();
             let noise = self.noise_of(0)[1];
-            self.external =
+            self.live.external =
                 self.momentum.as_mut().map(|momentum| momentum.conclude(sequence, &carried, noise, valid));
         }
         let estimate = joint_estimate(self.arrangement, sequence, flags, parts, self.motors);
-        self.estimate = Some(estimate);
+        self.live.estimate = Some(estimate);
         estimate
     }
 
     /// What is said where the sample cannot be used: the last estimate, for a while.
     pub(super) fn hold(&mut self, sequence: u64, flags: u32) -> Estimate {
-        self.rejected += 1;
-        self.external = self.momentum.as_ref().map(|momentum| momentum.latest.repeat(sequence));
-        let since = self.rejected as f64 * self.period;
+        self.live.rejected += 1;
+        self.live.external = self.momentum.as_ref().map(|momentum| momentum.latest.repeat(sequence));
+        let since = self.live.rejected as f64 * self.period;
         let rejected = Some(Why::new(Reason::Rejected, None));
-        let Some(last) = self.estimate else {
-            self.why = rejected;
+        let Some(last) = self.live.estimate else {
+            self.live.why = rejected;
             return joint_estimate(self.arrangement, sequence, flags, self.parts(0.0), self.motors);
         };
         let mut flags = flags | last.status & (status::CHANGED | status::RESTARTED);
         let was = |bit: u32| last.status & bit != 0;
         if since > BRIEF_S {
-            self.why = rejected;
+            self.live.why = rejected;
             return Estimate { sequence, status: flags, ..last };
         }
         let parts = self.parts(since);
         let [why, of_torque] = self.reasons(&parts, true);
         if was(status::VALID) {
-            self.why = why;
+            self.live.why = why;
         }
-        if self.why.is_none() {
+        if self.live.why.is_none() {
             flags |= status::VALID;
         }
         if was(status::TORQUE_VALID) && of_torque.is_none() {
@@ -87,8 +87,10 @@ impl Robust {
         for (i, (side, part)) in self.sides.iter().zip(parts).enumerate() {
             let reasons = side.reasons(part, self.valid_within, settled);
             let left = self.rigid.get(i).and_then(|balance| {
-                let noise =
-                    [self.torque_noise[i].variance(f64::INFINITY), self.noise_of(i)[0] * self.noise_gains[2]];
+                let noise = [
+                    self.live.torque_noise[i].variance(f64::INFINITY),
+                    self.noise_of(i)[0] * self.noise_gains[2],
+                ];
                 balance.unexplained(self.valid_within, noise).map(Reason::Unexplained)
             });
             for (found, reason) in found.iter_mut().zip(reasons.map(|reason| reason.or(left))) {
@@ -109,7 +111,7 @@ impl Robust {
         let behind_s = self.corrections.behind_s();
         let mut parts = [TransmissionEstimate::NOTHING; MOTORS];
         for (i, side) in self.sides.iter().enumerate() {
-            let phi = self.last.present.deflection(i);
+            let phi = self.live.last.present.deflection(i);
             let present = Present { phi, behind_s, ahead_s: since_s + waited };
             parts[i] = side.estimate(&present, self.filters.delay);
         }

@@ -12,9 +12,9 @@ impl Robust {
         if self.alignment.shift(periods) == 0.0 {
             return;
         }
-        self.unsettled = self.settle;
+        self.live.unsettled = self.settle;
         self.momentum.iter_mut().for_each(LinkMomentum::distrust);
-        let last = &self.last.at;
+        let last = &self.live.last.at;
         for (i, side) in self.sides.iter_mut().enumerate() {
             side.relearn(last.motor[i], last.deflection(i));
         }
@@ -22,23 +22,23 @@ impl Robust {
 
     /// The zero of one motor has been found so far from where its deflections are counted from.
     pub(super) fn recentre(&mut self, i: usize, off: f64) {
-        self.zeros.motor[i] += off;
-        self.last.at.motor[i] -= off;
-        self.last.present.motor[i] -= off;
-        self.unsettled = self.settle;
-        let at = &self.last.at;
+        self.live.zeros.motor[i] += off;
+        self.live.last.at.motor[i] -= off;
+        self.live.last.present.motor[i] -= off;
+        self.live.unsettled = self.settle;
+        let at = &self.live.last.at;
         let side = &mut self.sides[i];
-        side.recentre(at.motor[i], at.deflection(i), self.last.torque[i]);
+        side.recentre(at.motor[i], at.deflection(i), self.live.last.torque[i]);
     }
 
     /// Positions may count from anywhere: each motor's from where they did, if blocks bear it out, or from here.
     pub(super) fn resume(&mut self, at: &Positions) {
-        let now = at.from_zeros(&self.zeros);
+        let now = at.from_zeros(&self.live.zeros);
         for (i, side) in self.sides.iter_mut().enumerate() {
             if side.may_be_as_before(now.deflection(i)) {
                 side.suspect_zero();
             } else {
-                self.zeros.motor[i] -= if self.flexible { now.deflection(i) } else { 0.0 };
+                self.live.zeros.motor[i] -= if self.flexible { now.deflection(i) } else { 0.0 };
                 side.move_zero(false);
             }
         }
@@ -46,17 +46,21 @@ impl Robust {
 
     /// Blocks say that a motor's zero is not where it was before a restart; nor are those of which they say nothing yet.
     pub(super) fn lose_here(&mut self, lost: [bool; MOTORS]) {
-        self.unsettled = self.settle;
+        self.live.unsettled = self.settle;
         for (i, side) in self.sides.iter_mut().enumerate() {
             if !lost[i] && !side.blocks.is_suspected() {
                 continue;
             }
-            let off = if self.flexible { self.last.at.deflection(i) } else { 0.0 };
-            self.zeros.motor[i] -= off;
-            self.last.at.motor[i] += off;
-            self.last.present.motor[i] += off;
+            let off = if self.flexible { self.live.last.at.deflection(i) } else { 0.0 };
+            self.live.zeros.motor[i] -= off;
+            self.live.last.at.motor[i] += off;
+            self.live.last.present.motor[i] += off;
             side.move_zero(false);
-            side.restart(self.last.at.motor[i], self.last.at.deflection(i), self.last.torque[i]);
+            side.restart(
+                self.live.last.at.motor[i],
+                self.live.last.at.deflection(i),
+                self.live.last.torque[i],
+            );
         }
     }
 
@@ -64,9 +68,9 @@ impl Robust {
     pub(super) fn move_zeros(&mut self, mut jumps: [f64; MOTORS + 1], at: &Positions, sequence: u64) {
         let m = self.motors;
         let ahead =
-            (sequence.wrapping_sub(self.sequence) as f64 + self.alignment.periods.abs()) * self.period;
+            (sequence.wrapping_sub(self.live.sequence) as f64 + self.alignment.periods.abs()) * self.period;
         // A deflection that went on as it was measures a jump; the validator is coarse.
-        let now = at.from_zeros(&self.zeros);
+        let now = at.from_zeros(&self.live.zeros);
         for i in 0..m {
             let side = &self.sides[i];
             if ahead > AHEAD_S || side.rigid || side.deflection.unsettled > 0 {
@@ -85,16 +89,16 @@ impl Robust {
             if moved.abs() < NEAR * jump.abs() { 0.0 } else { moved }
         };
         for i in 0..m {
-            self.zeros.motor[i] = moved(self.zeros.motor[i], jumps[i]);
+            self.live.zeros.motor[i] = moved(self.live.zeros.motor[i], jumps[i]);
         }
         if self.flexible {
-            self.zeros.link = moved(self.zeros.link, jumps[m]);
+            self.live.zeros.link = moved(self.live.zeros.link, jumps[m]);
         }
-        let now = at.from_zeros(&self.zeros);
+        let now = at.from_zeros(&self.live.zeros);
         for (i, side) in self.sides.iter_mut().enumerate() {
             let known = ahead <= AHEAD_S && side.is_within(now.deflection(i));
             if !known {
-                self.zeros.motor[i] = at.motor[i] - now.link; // in the middle of where it can be
+                self.live.zeros.motor[i] = at.motor[i] - now.link; // in the middle of where it can be
             }
             side.move_zero(known);
         }

@@ -13,13 +13,14 @@ from zenohkit import free_endpoint
 
 from drivelink.canopen.bus import run_program
 from drivelink.canopen.guard import check_frame
-from drivelink.canopen.layout import roles
+from drivelink.canopen.layout import NodeLayout, roles
 from drivelink.canopen.node import survey_node
 from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.canopen.pdo import decode
 from drivelink.canopen.scan import _identify, listen, scan
 from drivelink.cli import main
 from drivelink.demo.simulate import network_from_joint, world_from_joint
-from drivelink.doctor import Report, Section, examine, examine_eds
+from drivelink.doctor import Report, Section, examine, examine_eds, nodes
 from drivelink.doctor.livevalues import Asked, Heard, record_of
 from drivelink.doctor.motion import judge_record
 from drivelink.doctor.nodes import _describe_node
@@ -316,6 +317,23 @@ def test_passive_nothing_is_sent_and_the_map_of_a_data_sheet_is_offered_to_paste
     assert f"in [link.encoder] {line}" in said and "has this map" not in said
     pasted = parse(text.replace("eds =", f"{line}\neds ="))
     assert "0x6004" not in " ".join(texts(examine(pasted, tmp_path, 0.1), Severity.WARNING))
+
+
+def test_a_passive_bus_is_judged_by_what_the_running_daemon_has_learnt(rig, monkeypatch):
+    active = parse(joint_on(rig))
+    with can.Bus(interface="virtual", channel=rig) as bus:
+        surveys = [run_program(survey_node(role), bus, active.bus) for role in roles(active)]
+    known = [
+        NodeLayout(node_id=one.role.node_id, motor=one.role.motor, tpdos=decode(one.tpdos, one.available))
+        for one in surveys
+    ]
+    joint = parse(joint_on(rig).replace("[bus]", '[bus]\nconfigure = false\nsync = "follow"'))
+    for served, says in (((), "no daemon of elbow runs"), ((joint.name,), "as the running daemon knows it")):
+        monkeypatch.setattr(nodes, "daemon_mapping", lambda *_: known)
+        report = Report()
+        nodes.examine_bus(report, joint, Path(), 0.1, served)
+        assert ("mapping is not known" in " ".join(texts(report))) is not bool(served)
+        assert says in " ".join(texts(report))
 
 
 def test_words_of_a_drive_do_not_reach_the_terminal_as_commands(capsys):

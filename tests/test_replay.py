@@ -18,7 +18,6 @@ import zenohkit
 from test_read_back import forge
 
 from drivelink import cli, jointfile, subscribe
-from drivelink.cli.record import _daemon_layouts
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.pubsub.publisher import JointPublisher, describe_model, to_json
@@ -28,6 +27,7 @@ from drivelink.recording import formats, read
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import mapping_document, recorded_layouts
 from drivelink.recording.playback import open_playback
+from drivelink.recording.recorder import daemon_layouts
 from drivelink.recording.sinks import Sink
 from estimator.sample import Estimate, Status
 
@@ -222,7 +222,7 @@ def asked_over_zenoh(joint, layouts, endpoint, folder):
     answering = threading.Thread(target=answer)
     answering.start()
     try:
-        return zenohkit.until(lambda: _daemon_layouts(asking, joint))
+        return zenohkit.until(lambda: daemon_layouts(asking, joint, print))
     finally:
         ended.set()
         answering.join()

@@ -44,11 +44,11 @@ class _PassiveNode:
     changed, so it is only suggested. Another identity or date of the configuration than before ends trust.
     """
 
-    def __init__(self, role: Role, sdo_timeout_s: float) -> None:
-        self.role = role
+    def __init__(self, role: Role, bus: BusSection) -> None:
+        self.role, self._bus = role, bus
         self._sheet = load_eds(role.eds, role.node_id) if role.eds is not None else None
         self._units = {address for vendor in VENDORS.values() for address in unit_objects(role, vendor)}
-        self.listener = SdoSniffer(self._interesting, sdo_timeout_s)
+        self.listener = SdoSniffer(self._interesting, bus.sdo_timeout_s)
         self.seen_changes = -1
         self.adopted: NodeLayout | None = None
         self.restarted = False  # or it may have
@@ -241,9 +241,12 @@ class _PassiveNode:
         if self.restarted:
             return self.doubt()
         heard = ", ".join(f"0x{cob_id:03X} ({length} bytes)" for cob_id, length in sorted(self.heard.items()))
+        # With `configure` only a recorder listens, beside the daemon that is to write the mapping.
+        late = "start drivelink before the master configures the drives"
+        help_ = "start drivelink run, which configures the drives" if self._bus.configure else late
         return (
             f"{role.subject} ({role.key}): its mapping is not known: give {self._keys()} or eds in the joint "
-            "file, or start drivelink before the master configures the drives"
+            f"file, or {help_}"
         ) + (f"; it sends {heard}" if heard else "")
 
 
@@ -279,8 +282,7 @@ class PassiveConfigurator:
     def __init__(self, joints: Sequence[JointFile], base_dirs: Sequence[Path] | None = None) -> None:
         self.bus: BusSection = joints[0].bus
         self._nodes = {
-            node: _PassiveNode(role, self.bus.sdo_timeout_s)
-            for node, role in roles_by_node(joints, base_dirs).items()
+            node: _PassiveNode(role, self.bus) for node, role in roles_by_node(joints, base_dirs).items()
         }
         self.layouts: dict[int, NodeLayout] = {}  # of the nodes that are known so far
         self.missing: dict[int, DriveError] = {}  # for the others, what is missing

@@ -23,12 +23,11 @@ from drivelink.cli import add_bus, add_seconds, handling, moved
 from drivelink.errors import BusError, DrivelinkError, RecordingError, UsageError, ZenohError
 from drivelink.files import check_target
 from drivelink.jointfile import JointFile, JointText
-from drivelink.pubsub.feed import DECODERS
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.recording.formats import FORMATS, open_sink
 from drivelink.recording.foxglove import write_layouts
-from drivelink.recording.mapping import layouts_from, mapping_document, side_file
-from drivelink.recording.recorder import BusTap, FirstSource, Recorder, ZenohTap
+from drivelink.recording.mapping import mapping_document, side_file
+from drivelink.recording.recorder import BusTap, FirstSource, Recorder, ZenohTap, daemon_layouts
 from drivelink.recording.sinks import Sink
 
 _ALIVE_S = 1.0  # in which a daemon answers
@@ -180,7 +179,7 @@ def _daemon(
         return None, False, ()
     stack.callback(close_session, session)
     alive = _alive(session, source.joint)
-    return session, alive, _daemon_layouts(session, source.joint) if alive else ()
+    return session, alive, daemon_layouts(session, source.joint, _say) if alive else ()
 
 
 def known_layouts(source: JointText) -> Sequence[NodeLayout]:
@@ -188,26 +187,6 @@ def known_layouts(source: JointText) -> Sequence[NodeLayout]:
     with ExitStack() as stack:
         *_, known = _daemon(source, stack, needed=False)
     return known or _declared_layouts(source.joint, source.folder)
-
-
-def _daemon_layouts(session: zenoh.Session, joint: JointFile) -> Sequence[NodeLayout]:
-    """Mapping of the joint's nodes by the running daemon; () if unknown.
-
-    Only the one session with the joint's liveliness token is trusted; none of several.
-    """
-    key = f"{joint.zenoh.prefix}/{joint.name}"
-    tokens = session.liveliness().get(f"{key}/alive/*", timeout=_ALIVE_S)
-    daemons = {str(reply.ok.key_expr).rpartition("/")[2] for reply in tokens if reply.ok}
-    if len(daemons) > 1:
-        _say(f"{len(daemons)} sessions say that they serve {joint.name}: none is asked for the mapping")
-        return ()
-    for reply in session.get(f"{key}/model", timeout=_ALIVE_S):
-        source = str(reply.replier_id.zid) if reply.replier_id else ""
-        if reply.ok and source in daemons:
-            with suppress(ValueError, ZenohError):
-                document = DECODERS["model"](reply.ok.payload.to_bytes())
-                return layouts_from(json.dumps(document).encode(), joint.name)
-    return ()
 
 
 def _declared_layouts(joint: JointFile, folder: Path) -> Sequence[NodeLayout]:

@@ -21,6 +21,7 @@ from drivelink.canopen.node import NodeSurvey, survey_node
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.scan import listen
 from drivelink.canopen.sdo import Program, Read, SdoAbort
+from drivelink.doctor.machine import daemon_mapping
 from drivelink.doctor.manualcheck import Value
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile
@@ -270,7 +271,9 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[LiveValues]:
             yield LiveValues(lambda seconds: run_program(asked.program(seconds), bus, joint.bus))
         else:
             silent = SilentBus(bus)
-            heard = Heard(joint, PassiveConfigurator([joint], [base_dir]))
+            known = PassiveConfigurator([joint], [base_dir])
+            known.adopt(daemon_mapping(joint, base_dir))
+            heard = Heard(joint, known)
             if not heard.listen(silent, _PATIENCE_S):
                 raise DriveError(f"{joint.name}: no sample in {_PATIENCE_S:g} s: {heard.missing}")
             yield LiveValues(partial(heard.listen, silent))

@@ -11,12 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.realtime import PRIORITY
 from drivelink.doctor.report import Section
 from drivelink.errors import ZenohError
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.pubsub.clientbase import joints
-from drivelink.pubsub.session import FILES, answers
+from drivelink.pubsub.session import FILES, answers, close_session, open_client
+from drivelink.recording.recorder import daemon_layouts
 
 _CPU = Path("/sys/devices/system/cpu")
 _NEEDED_LOCKED = 256 << 20  # bytes; the daemon's resident size is below
@@ -175,6 +177,26 @@ def _judge_producer(section: Section, text: str, daemons: Daemons) -> None:
         )
 
 
+def daemon_mapping(joint: JointFile, base_dir: Path) -> Sequence[NodeLayout]:
+    """Return what the running daemon of a passive joint knows of its nodes; () without one."""
+    config = _config(joint, base_dir)
+    if config is None and not answers(joint.zenoh.endpoint):
+        return ()
+    try:
+        session = open_client(joint.zenoh.endpoint, config)
+    except ZenohError:  # reported by `examine_zenoh`
+        return ()
+    try:
+        return daemon_layouts(session, joint, lambda _: None)
+    finally:
+        close_session(session)
+
+
+def _config(joint: JointFile, base_dir: Path) -> Path | None:
+    named = joint.zenoh.subscriber_config or joint.zenoh.config
+    return base_dir / named if named else None
+
+
 def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> list[str]:
     """Check who listens at the endpoint, and whether this joint's key is taken.
 
@@ -186,8 +208,8 @@ def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> list[st
         if not (base_dir / name).is_file():
             section.error("zenoh", f"{name}: there is no such file", "correct [zenoh] in the joint file")
             return []
-    named = settings.subscriber_config or settings.config
-    config, where = base_dir / named if named else None, named or settings.endpoint
+    config = _config(joint, base_dir)
+    where = settings.subscriber_config or settings.config or settings.endpoint
     if config is None and not answers(settings.endpoint):
         section.ok("zenoh", f"{where}: nobody there yet, the daemon will listen there")
         return []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -34,7 +35,7 @@ from drivelink.doctor.datasheet import (
     velocity_as_check,
 )
 from drivelink.doctor.livevalues import Asked, Heard, record_of
-from drivelink.doctor.machine import Daemons, judge_sync
+from drivelink.doctor.machine import Daemons, daemon_mapping, judge_sync
 from drivelink.doctor.motion import judge_motion, judge_record
 from drivelink.doctor.report import Report, Section
 from drivelink.errors import BusError, DriveError, JointFileError
@@ -283,11 +284,18 @@ def _overhear(
 ) -> None:
     """Check a passive bus by listening."""
     configurator = PassiveConfigurator([joint], [base_dir])
+    if learnt := daemon_mapping(joint, base_dir) if daemons.ours else ():
+        configurator.adopt(learnt)
+        nodes = _list([layout.node_id for layout in learnt])
+        section.ok("mapping", f"{nodes}: as the running daemon knows it")
     heard = Heard(joint, configurator)
     traffic = listen(bus, seconds, heard.feed)
     _judge_traffic(section, traffic, joint.bus, daemons)
+    configurator.poll(time.monotonic())  # with the frames that were heard
     for error in configurator.missing.values():
         section.error(joint.bus.channel, str(error))
+    if configurator.missing and not daemons.ours:
+        section.info("mapping", f"no daemon of {joint.name} runs that could be asked for it")
     for node, doubt in configurator.doubts.items():
         section.warn(f"node {node}", doubt)
     for node, layout in configurator.layouts.items():

@@ -28,6 +28,7 @@ from drivelink.pubsub.feed import DECODERS, DaemonIdentity, follow_document, sou
 from drivelink.recording.canlog import LoggedFrame
 from drivelink.recording.cycles import FrameSamples
 from drivelink.recording.limits import MAX_BLOCK_BYTES
+from drivelink.recording.mapping import layouts_from
 from drivelink.recording.sinks import Sink
 from estimator.sample import Sample
 
@@ -38,6 +39,7 @@ _SNAPSHOTS = 2  # that wait: each has some megabytes
 _FLUSH_S = 1.0
 _POLL_S = 0.005
 _REOPEN_S = 0.5
+_ANSWER_S = 1.0  # of a daemon
 _STALE_S = 1.0  # after which another session may take over without a liveliness token
 
 
@@ -272,3 +274,25 @@ class Recorder:
         for tap in self.taps:
             tap.poll()
             tap.finish()
+
+
+def daemon_layouts(
+    session: zenoh.Session, joint: JointFile, say: Callable[[str], object]
+) -> Sequence[NodeLayout]:
+    """Return the mapping of the joint's nodes by its running daemon; () if unknown.
+
+    Only the one session with the joint's liveliness token is trusted; none of several.
+    """
+    key = f"{joint.zenoh.prefix}/{joint.name}"
+    tokens = session.liveliness().get(f"{key}/alive/*", timeout=_ANSWER_S)
+    daemons = {str(reply.ok.key_expr).rpartition("/")[2] for reply in tokens if reply.ok}
+    if len(daemons) > 1:
+        say(f"{len(daemons)} sessions say that they serve {joint.name}: none is asked for the mapping")
+        return ()
+    for reply in session.get(f"{key}/model", timeout=_ANSWER_S):
+        source = str(reply.replier_id.zid) if reply.replier_id else ""
+        if reply.ok and source in daemons:
+            with suppress(ValueError, ZenohError):
+                document = DECODERS["model"](reply.ok.payload.to_bytes())
+                return layouts_from(json.dumps(document).encode(), joint.name)
+    return ()

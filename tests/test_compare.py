@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 from drivelink import cli, jointfile
 from drivelink.comparison import compare
 from drivelink.demo.simulate import alter, world_from_joint
+from drivelink.output.comparison import fits
 from sim.world import record
 
 ELBOW = Path(__file__).parent.parent / "examples" / "elbow.toml"
@@ -53,6 +56,18 @@ def test_friction_that_nobody_declared_is_in_the_curve_and_in_the_free_run(runs)
     assert abs(abs(friction.b - friction.a) - 0.6) < 0.1
     (_, declared, fitted) = made.runs[0]
     assert min(fitted.fit_percent.values()) > 99.0 > 90.0 > max(declared.fit_percent.values())
+
+
+def test_motion_at_constant_velocity_stands_beside_a_free_run_only_where_it_beats_the_mean(runs):
+    run = compare(ELBOW, runs / "healthy.csv", horizon_s=1.0).runs[0][1]
+    names = run.channels
+    shown = []
+    for coasting in ([-500.0] * 3, [40.0, -500.0, math.nan]):
+        one = replace(run, coasting_percent=dict(zip(names, coasting, strict=True)))
+        (grid,) = fits({"declared": one}, "healthy.csv").blocks
+        shown.append((grid.head[-1], [row[-1] for row in grid.rows]))
+    assert shown[0][0] == "declared" and "diverges" not in shown[0][1]
+    assert shown[1] == ("at constant velocity", ["40.0 %", "below 0 %", "–"])
 
 
 def test_the_verb_writes_a_page_and_numbers(runs, capsys):

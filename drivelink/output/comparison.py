@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -198,13 +199,19 @@ def fits(runs: Mapping[str, FreeRun], of: str) -> Section:
     first = next(iter(runs.values()), None)
     if first is None:
         return Section("", [])
-    each = [*(run.fit_percent for run in runs.values()), first.coasting_percent]
-    rows: Rows = [
-        (_in_words(name), *("diverges" if fit[name] < _DIVERGES else f"{fit[name]:.1f} %" for fit in each))
-        for name in first.channels
-    ]
-    heads = (f"fit of {of}", *runs, "at constant velocity")
+    columns = {name: [_fit(run.fit_percent[c]) for c in first.channels] for name, run in runs.items()}
+    if any(percent >= 0.0 for percent in first.coasting_percent.values()):  # the mean is a better rival else
+        at_constant = [first.coasting_percent[channel] for channel in first.channels]
+        columns["at constant velocity"] = [_fit(fit) if not fit < 0.0 else "below 0 %" for fit in at_constant]
+    rows: Rows = list(zip(map(_in_words, first.channels), *columns.values(), strict=True))
+    heads = (f"fit of {of}", *columns)
     return Section(f"free run, from measured states every {first.horizon_s:.3g} s", [Grid(heads, rows)])
+
+
+def _fit(percent: float) -> str:
+    if math.isnan(percent):  # a channel that does not vary
+        return "–"
+    return "diverges" if percent < _DIVERGES else f"{percent:.1f} %"
 
 
 def fits_json(runs: Mapping[str, FreeRun], of: str) -> dict[str, Any]:

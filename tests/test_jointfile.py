@@ -77,6 +77,7 @@ def test_the_contract_s_example_is_read_as_written():
         ('name = "elbow"', 'name = "el/bow"', "name: expected letters, digits"),
         ('"robust"', '"rob"', "estimator.mode: input should be 'robust' or 'paper', got 'rob'"),
         ("gravity_nm", "grav", "link.dynamics.grav: unknown key, expected one of inertia_kg_m2"),
+        ('"coulomb_friction"', '"ears"', 'motor[1]: effect "ears": expected one of'),
         ('"single"', '"serial"', 'motor: expected 2 [[motor]] with arrangement = "serial", got 1'),
         ("[bus]", "[bus", "expected TOML"),
         ('prefix = "drivelink"', 'prefix = "a b"', "zenoh.prefix: expected parts of a zenoh key"),

@@ -9,6 +9,7 @@ from annotated_types import Gt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivelink.jointfile.columns import COLUMNS, si_factor
+from estimator.effects import elements
 from estimator.model import (
     Arrangement,
     Effect,
@@ -157,6 +158,8 @@ class MotorSection(_Section):
     @model_validator(mode="after")
     def _parameters_can_be(self) -> MotorSection:
         transmission_model(self.transmission)
+        for effect in self.effect:
+            elements(effect)
         return self
 
     def motor(self) -> Motor:
@@ -183,6 +186,12 @@ class LinkSection(_Section):
     effect: tuple[Effect, ...] = Field(
         (), max_length=MOST_EFFECTS, description="effects at the link or in its encoder"
     )
+
+    @model_validator(mode="after")
+    def _effects_can_be(self) -> LinkSection:
+        for effect in self.effect:
+            elements(effect)
+        return self
 
 
 class BusSection(_Section):

@@ -143,7 +143,7 @@ def test_keep_without_a_black_box_says_what_it_expects(tmp_path, capsys):
     assert "recording.folder: expected the folder of the black box" in capsys.readouterr().err
     path.write_text(path.read_text() + '[recording]\nfolder = "kept"\n')
     assert cli.main(["keep", str(path)]) == 3
-    assert "no black box writes there" in capsys.readouterr().err
+    assert "no black box writes there: expected a daemon that was started since" in capsys.readouterr().err
 
 
 def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path):

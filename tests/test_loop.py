@@ -113,7 +113,7 @@ def test_where_nothing_has_changed_nothing_is_proposed(tmp_path):
     assert (found["state"], found["since"]) == (finding.NOTHING, None)
     assert not proposal_file(made).exists()
     finding.write(made, found)
-    with pytest.raises(RecordingError, match="nothing to accept: nothing: The model is sufficient"):
+    with pytest.raises(RecordingError, match="nothing to accept: The model is sufficient"):
         acceptance.proposal(tmp_path / "elbow.toml")
 
 

@@ -43,7 +43,10 @@ def run(args: argparse.Namespace) -> int:
                 raise RecordingError(f"{wish.parent}: no black box answers: expected a running daemon")
             time.sleep(_POLL_S)
     except OSError as error:
-        raise RecordingError(f"{wish.parent}: no black box writes there: {error.strerror}") from error
+        raise RecordingError(
+            f"{wish.parent}: no black box writes there: expected a daemon that was started since the joint "
+            f"file has [recording] ({error.strerror})"
+        ) from error
     found = {"folder": str(wish.parent), "after_s": AFTER_S}
     print(json.dumps(found) if args.json else f"{wish.parent}: written in {AFTER_S:g} s")
     return 0

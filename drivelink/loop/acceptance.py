@@ -66,7 +66,8 @@ def proposal(path: Path) -> Proposal:
         )
     recording, found = newest
     if found["state"] != finding.PROPOSED:
-        raise RecordingError(f"{recording.name}: nothing to accept: {found['state']}: {found['sentence']}")
+        state = "" if found["state"] == finding.NOTHING else f"{found['state']}: "
+        raise RecordingError(f"{recording.name}: nothing to accept: {state}{found['sentence']}")
     if found.get("joint_file") != finding.fingerprint(source.text):
         raise RecordingError(
             f"{path}: has changed since {recording.name} was kept: expected the same joint file; "

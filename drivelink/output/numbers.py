@@ -34,7 +34,7 @@ def value_and_interval(value: float, half: float | None, digits: int = 4) -> tup
     last = int(f"{half:.1e}".partition("e")[2]) - 1  # power of ten of the interval's second digit
     power, largest = 0, max(abs(value), half)
     if not 1e-3 <= largest < 1e6:
-        power = math.floor(math.log10(largest))
+        power = math.floor(math.log10(round(largest, -last)))
     decimals = power - last
 
     def shown(x: float) -> str:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from drivelink.cycle.objectcheck import RecentSamples
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.recording.canlog import CAN_FORMATS, NO_STAMP, LoggedFrame, read_frames
@@ -172,5 +173,6 @@ def test_a_sample_that_the_next_sync_completes_has_the_stamp_of_its_own():
     assembly, made = Assembly.__new__(Assembly), iter([None, Sample(0, (0.0,), (0.0,), (0.0,), 0.0)])
     assembly._stamp_ns = assembly._before_ns = 0
     assembly.assembler = SimpleNamespace(feed=lambda *_: next(made), sequence=1, flags=0, missed=-1)
-    assert assembly.cycle(0x080, b"", 1, 100) is None
-    assert assembly.cycle(0x080, b"", 1, 200).stamp_ns == 100
+    assembly.follower, assembly._recent = SimpleNamespace(feed=lambda *_: None), RecentSamples(1e-3)
+    assembly._period_s = 1e-3
+    assert [cycle.stamp_ns for cycle in assembly.cycles(syncs([1e-4, 2e-4]), 1)] == [100]

@@ -19,7 +19,7 @@ from fuzzparsers import JOINT, RECORDINGS, TEXT, frames, held, read_every_way, w
 from drivelink.canopen.eds import load_eds
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import ZenohSection, load
-from drivelink.recording import read
+from drivelink.recording import canframes, read
 from drivelink.recording.canlog import CAN_FORMATS, read_frames
 from drivelink.recording.corrections import Gathered
 from drivelink.recording.formats import FORMATS, open_sink
@@ -284,6 +284,15 @@ def test_a_huge_message_is_refused_before_it_is_parsed(topic, begin, tmp_path):
         for work in (lambda: joint_of(path, None), lambda: read(path, JOINT)):
             with one_line(error=DrivelinkError):
                 work()
+
+
+def test_equal_frames_of_a_joint_at_rest_are_parsed_once(tmp_path, monkeypatch):
+    parsed = []
+    monkeypatch.setattr(canframes, "message_fields", lambda text: parsed.append(text) or message_fields(text))
+    at_rest = [(stamp, can_id, b"\x64\0" * (len(data) // 2)) for stamp, can_id, data in frames(2000)]
+    texts = [("can", stamp, f'{{"id":{i},"data":"{d.hex()}","rest":1}}'.encode()) for stamp, i, d in at_rest]
+    assert len(read(mcap_of(tmp_path / "r.mcap", texts), JOINT)) == 2000
+    assert len(parsed) == 3
 
 
 def test_frames_without_end_are_neither_held_nor_read(tmp_path):

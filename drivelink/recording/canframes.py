@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from itertools import chain, islice
 from pathlib import Path
 
@@ -20,7 +21,15 @@ from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, LoggedFrame, in_order, read_frames
 from drivelink.recording.columns import record_of_samples
-from drivelink.recording.cycles import OF_MAPS, OF_SDO, Assembly, Cycle, numbered_ahead, numbered_at_once
+from drivelink.recording.cycles import (
+    OF_MAPS,
+    OF_SDO,
+    Assembly,
+    Cycle,
+    numbered_ahead,
+    numbered_at_once,
+    seconds,
+)
 from drivelink.recording.grid import report_gaps
 from drivelink.recording.mapping import recorded_layouts, side_file
 from drivelink.recording.mcapfile import message_fields, read_messages
@@ -100,16 +109,13 @@ class FrameLog:
         Raises:
             RecordingError: the recording is damaged, or contains no sample.
         """
-        assembly, heard, samples = self._assembly, set(), False
+        assembly, heard, samples = self._assembly, set[int](), False
         numbered = numbered_at_once if self._follow else numbered_ahead
-        for (stamp_ns, can_id, data, _), jump in numbered(chain(self._head, self._frames), self.period_s):
-            cycle = assembly.cycle(can_id, data, jump, stamp_ns)
-            heard.add(can_id)
-            sample = None if cycle is None else cycle.sample
-            samples |= sample is not None
-            now_s = _seconds(stamp_ns, assembly.assembler.sequence, self.period_s)
-            assembly.follow(can_id, data, sample, now_s)
-            if cycle is not None:
+        for frames, jump in numbered(chain(self._head, self._frames), self.period_s):
+            if not samples:
+                heard.update(frame.can_id for frame in frames)
+            for cycle in assembly.cycles(frames, jump):
+                samples = samples or cycle.sample is not None
                 yield cycle
         doubts = list(assembly.follower.doubts.values())
         if not samples:
@@ -156,7 +162,7 @@ class FrameLog:
                 if quiet > _QUIET_SYNCS and not listener.busy:
                     break
             elif can_id in (OF_MAPS if self._passive else OF_SDO) and (listener.busy or not self._passive):
-                now_s = _seconds(stamp_ns, len(syncs), listener.bus.period_s)
+                now_s = seconds(stamp_ns, len(syncs), listener.bus.period_s)
                 listener.feed(can_id, data, now_s)
                 if listener.poll(now_s):
                     head.clear()
@@ -208,19 +214,20 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
     return record
 
 
-def _seconds(stamp_ns: int, sync: int, period_s: float) -> float:
-    """Time of a frame; in a log without stamps, that of its SYNC."""
-    return stamp_ns * 1e-9 if stamp_ns != NO_STAMP else sync * period_s
-
-
 def _mcap_frames(path: Path) -> Iterator[LoggedFrame]:
-    for message in read_messages(path, frozenset({"can"})):
+    for topic, stamp_ns, text in read_messages(path, frozenset({"can"})):
         try:
-            fields = message_fields(message.data)
-            can_id, data = int(fields["id"]), bytes.fromhex(fields["data"])
-            if not 0 <= can_id <= 0x7FF or len(data) > 64:
-                raise ValueError("expected an 11-bit identifier and at most 64 bytes")
+            can_id, data = _frame(text)
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-            reason = f"{message.topic[:80]} is no frame of drivelink: {error}"
-            raise RecordingError(f"{path}: {reason}") from error
-        yield LoggedFrame(message.log_time_ns, can_id, data, "")
+            raise RecordingError(f"{path}: {topic[:80]} is no frame of drivelink: {error}") from error
+        yield LoggedFrame(stamp_ns, can_id, data, "")
+
+
+@lru_cache(maxsize=256)  # of a joint at rest, the same ones come again and again
+def _frame(text: bytes) -> tuple[int, bytes]:
+    """Identifier and bytes of a message."""
+    fields = message_fields(text)
+    can_id, data = int(fields["id"]), bytes.fromhex(fields["data"])
+    if not 0 <= can_id <= 0x7FF or len(data) > 64:
+        raise ValueError("expected an 11-bit identifier and at most 64 bytes")
+    return can_id, data

@@ -9,6 +9,7 @@ import difflib
 import logging
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -112,16 +113,9 @@ def sample_columns(motors: int) -> tuple[str, ...]:
 
 def sample_row(sample: Sample, period_s: float) -> tuple[float, ...]:
     """Return a sample as the values of `sample_columns`; its time is that of its SYNC, sequence * period."""
-    per_motor = zip(
-        sample.motor_position_rad, sample.motor_velocity_rad_s, sample.motor_torque_nm, strict=True
-    )
-    return (
-        sample.sequence * period_s,
-        *(value for motor in per_motor for value in motor),
-        sample.link_position_rad,
-        sample.link_velocity_rad_s,
-        sample.external_torque_nm,
-    )
+    sequence, position, velocity, torque, *of_link = sample
+    per_motor = chain.from_iterable(zip(position, velocity, torque, strict=True))
+    return (sequence * period_s, *per_motor, *of_link)
 
 
 def record_of_samples(samples: Iterable[Sample], motors: int, period_s: float, where: str) -> Record:
@@ -137,7 +131,7 @@ def record_of_samples(samples: Iterable[Sample], motors: int, period_s: float, w
         for sample in samples:
             first = sample.sequence if first is None else first
             require_samples(sample.sequence - first + 1, where)
-            yield (float(sample.sequence), *sample_row(sample, period_s)[1:])
+            yield sample_row(sample, 1.0)
 
     table = np.fromiter(rows(), dtype=np.dtype((np.float64, len(names))))
     if len(table) < 3:

@@ -7,7 +7,7 @@ one all stay behind. `SyncClock` has to decide at once and cannot distinguish th
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from drivelink._core import SYNC_COB_ID, JointPipeline, Tick
@@ -48,18 +48,22 @@ _EXTRA = -0.5  # periods too early: a SYNC of another master
 _FOLLOW = 0.05  # of the deviation, per SYNC: the two clocks drift
 
 
-def numbered_at_once(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[tuple[LoggedFrame, int]]:
-    """Each frame with the jump of its SYNC, decided as in the live loop."""
+Numbered = tuple[Sequence[LoggedFrame], int]
+"""Frames, and the jump of the SYNC that may be the first: periods since the one before, 0 if not due."""
+
+
+def numbered_at_once(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[Numbered]:
+    """Each frame, its SYNC numbered as in the live loop."""
     clock = SyncClock(period_s)
     for frame in frames:
         if frame.can_id == SYNC_COB_ID and frame.stamp_ns != NO_STAMP:
-            yield frame, clock.jump(frame.stamp_ns)
+            yield (frame,), clock.jump(frame.stamp_ns)
         else:
-            yield frame, 1
+            yield (frame,), 1
 
 
-def numbered_ahead(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[tuple[LoggedFrame, int]]:
-    """Each frame with the jump of its SYNC: periods since the previous one, 0 if not due."""
+def numbered_ahead(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[Numbered]:
+    """Each SYNC, numbered by later ones, with the frames until the next one."""
     numbering = SyncNumbering(period_s)
     for frame in frames:
         yield from numbering.push(frame)
@@ -81,25 +85,21 @@ class SyncNumbering:
         self._cycles: deque[list[LoggedFrame]] = deque()  # each waiting SYNC and its frames
         self._stamps: deque[int] = deque()  # of these SYNCs
 
-    def push(self, frame: LoggedFrame) -> list[tuple[LoggedFrame, int]]:
-        """Take a frame; return the frames decided now, each with its jump."""
+    def push(self, frame: LoggedFrame) -> Sequence[Numbered]:
+        """Take a frame; return what is decided now."""
+        cycles = self._cycles
         if frame.can_id == SYNC_COB_ID:
-            self._cycles.append([frame])
+            cycles.append([frame])
             self._stamps.append(frame.stamp_ns)
-            return self._released() if len(self._cycles) > _AHEAD else []
-        if self._cycles:
-            self._cycles[-1].append(frame)
-            return []
-        return [(frame, 1)]
+            return ((cycles.popleft(), self._jump()),) if len(cycles) > _AHEAD else ()
+        if cycles:
+            cycles[-1].append(frame)
+            return ()
+        return (((frame,), 1),)
 
-    def rest(self) -> list[tuple[LoggedFrame, int]]:
-        """End the stream; return all waiting frames."""
-        return [numbered for _ in range(len(self._cycles)) for numbered in self._released()]
-
-    def _released(self) -> list[tuple[LoggedFrame, int]]:
-        """Release the first waiting cycle."""
-        sync, *others = self._cycles.popleft()
-        return [(sync, self._jump()), *[(frame, 1) for frame in others]]
+    def rest(self) -> Sequence[Numbered]:
+        """End the stream; return all that waits."""
+        return [(self._cycles.popleft(), self._jump()) for _ in range(len(self._cycles))]
 
     def _jump(self) -> int:
         """The jump of the first waiting SYNC."""
@@ -130,6 +130,11 @@ class SyncNumbering:
         return 1 + lost
 
 
+def seconds(stamp_ns: int, sync: int, period_s: float) -> float:
+    """Return the time of a frame; in a log without stamps, that of its SYNC."""
+    return stamp_ns * 1e-9 if stamp_ns != NO_STAMP else sync * period_s
+
+
 class Assembly:
     """Makes the cycles of numbered frames, and follows what else they say of the nodes' mapping.
 
@@ -143,29 +148,28 @@ class Assembly:
 
     def __init__(self, joint: JointFile, listener: PassiveConfigurator) -> None:
         self.assembler = make_assembler(joint, tuple(listener.layouts.values()))  # makes the samples
-        self._recent = RecentSamples(joint.bus.period_s)
+        self._period_s = joint.bus.period_s
+        self._recent = RecentSamples(self._period_s)
         self.follower = follow_log(listener, self.assembler, self._recent)
         self._stamp_ns = self._before_ns = 0  # of the newest SYNC, and of the one before
 
-    def cycle(self, can_id: int, data: bytes, jump: int, stamp_ns: int) -> Cycle | None:
-        """Take a frame; return the cycle that it ends, if any."""
-        assembler = self.assembler
-        sample = assembler.feed(can_id, data, jump)
-        if can_id == SYNC_COB_ID and jump > 0:
-            self._before_ns, self._stamp_ns = self._stamp_ns, stamp_ns
-        if sample is not None:
-            at_ns = self._before_ns if sample.sequence != assembler.sequence else self._stamp_ns
-            return Cycle(sample.sequence, at_ns, sample, assembler.flags)
-        if can_id == SYNC_COB_ID and jump and (missed := assembler.missed) >= 0:
-            return Cycle(missed, self._before_ns, None, assembler.flags)
-        return None
-
-    def follow(self, can_id: int, data: bytes, sample: Sample | None, now_s: float) -> None:
-        """Compare a frame with the mapping, after its cycle was made."""
-        if sample is not None:
-            self._recent.add(sample)
-        if can_id in OF_MAPS or can_id == SYNC_COB_ID:
-            self.follower.feed(can_id, data, now_s)
+    def cycles(self, frames: Iterable[LoggedFrame], jump: int) -> Iterator[Cycle]:
+        """Take numbered frames; yield the cycles that they end."""
+        assembler, feed = self.assembler, self.assembler.feed
+        for stamp_ns, can_id, data, _ in frames:
+            cycle, sample, is_sync = None, feed(can_id, data, jump), can_id == SYNC_COB_ID
+            if is_sync and jump > 0:
+                self._before_ns, self._stamp_ns = self._stamp_ns, stamp_ns
+            if sample is not None:
+                at_ns = self._before_ns if sample.sequence != assembler.sequence else self._stamp_ns
+                cycle = Cycle(sample.sequence, at_ns, sample, assembler.flags)
+                self._recent.add(sample)
+            elif is_sync and jump and (missed := assembler.missed) >= 0:
+                cycle = Cycle(missed, self._before_ns, None, assembler.flags)
+            if is_sync or can_id in OF_MAPS:  # it is compared with the mapping after its cycle was made
+                self.follower.feed(can_id, data, seconds(stamp_ns, assembler.sequence, self._period_s))
+            if cycle is not None:
+                yield cycle
 
 
 class FrameSamples:
@@ -205,15 +209,13 @@ class FrameSamples:
         """Return the samples that wait for later SYNCs."""
         return self._made(self._numbering.rest())
 
-    def _made(self, numbered: list[tuple[LoggedFrame, int]]) -> list[tuple[Sample, int]]:
+    def _made(self, numbered: Iterable[Numbered]) -> list[tuple[Sample, int]]:
         found = []
-        for (stamp_ns, can_id, data, _), jump in numbered:
-            assembly = self._assembly or self._begun(can_id, data, stamp_ns * 1e-9)
-            if assembly is not None:
-                made = assembly.cycle(can_id, data, jump, stamp_ns)
-                sample = None if made is None else made.sample
-                assembly.follow(can_id, data, sample, stamp_ns * 1e-9)
-                found += [] if made is None or sample is None else [(sample, made.stamp_ns)]
+        for frames, jump in numbered:
+            for frame in frames:
+                assembly = self._assembly or self._begun(frame.can_id, frame.data, frame.stamp_ns * 1e-9)
+                made = () if assembly is None else assembly.cycles((frame,), jump)
+                found += [(cycle.sample, cycle.stamp_ns) for cycle in made if cycle.sample is not None]
         return found
 
     def _begun(self, can_id: int, data: bytes, now_s: float) -> Assembly | None:

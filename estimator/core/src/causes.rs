@@ -246,8 +246,7 @@ impl Known<'_> {
         // The place of the cause's own amplitude: an unknown that is not in the set, or the last one.
         let own = (1..UNKNOWNS).rev().find(|i| self.set >> i & 1 == 0);
         let evidence = |square: f64, log_ratio: f64| {
-            // What is left below the noise that is foreseen speaks for nothing.
-            let square = square.max(independent);
+            let square = square.max(independent); // what is left below the noise speaks for nothing
             -0.5 * (independent + noise.tails) * (square / noise.tails).ln_1p() + 0.5 * log_ratio
         };
         let mut odds = Odds { of: [Explanation::default(); CAUSES], log: [f64::NEG_INFINITY; CAUSES] };
@@ -282,13 +281,8 @@ impl Known<'_> {
                 judged(entry.cause, &more, self.set | bit(own), &prior, unit);
             }
         }
-        // Larger errors: as much larger as fits best, at the price of that choice.
-        let factor = (healthy / independent).max(1.0);
-        odds.log[Cause::Noise as usize] = odds.log[0] - evidence(healthy, 0.0) + evidence(independent, 0.0)
-            - 0.5 * independent * factor.ln()
-            - 0.5 * independent.ln_1p();
-        odds.of[Cause::Noise as usize] =
-            Explanation { misfit: 1.0, amplitude: factor.sqrt(), ..Explanation::default() };
+        let gain = evidence(independent, 0.0) - evidence(healthy, 0.0);
+        odds.add_noise((healthy / independent).max(1.0), independent, gain);
         odds.normalise(before);
         odds
     }
@@ -322,6 +316,14 @@ fn information(reduced: &Matrix, precision: &Matrix, scale: f64) -> Matrix {
 }
 
 impl Odds {
+    /// Larger errors: as much larger as fits best, at the price of that choice.
+    fn add_noise(&mut self, factor: f64, independent: f64, gain: f64) {
+        let price = 0.5 * independent * factor.ln() + 0.5 * independent.ln_1p();
+        self.log[Cause::Noise as usize] = self.log[0] + gain - price;
+        self.of[Cause::Noise as usize] =
+            Explanation { misfit: 1.0, amplitude: factor.sqrt(), ..Explanation::default() };
+    }
+
     fn normalise(&mut self, before: f64) {
         let each = (before / (CAUSES - 1) as f64).max(f64::MIN_POSITIVE).ln();
         let most = self.log.iter().skip(1).fold(self.log[0], |most, log| most.max(log + each));

@@ -57,6 +57,16 @@ pub struct Corrected {
     pub present: Sample,
 }
 
+const NOTHING: Sample = Sample {
+    sequence: 0,
+    motor_position: [f64::NAN; MOTORS],
+    motor_velocity: [f64::NAN; MOTORS],
+    motor_torque: [f64::NAN; MOTORS],
+    link_position: f64::NAN,
+    link_velocity: f64::NAN,
+    external_torque: f64::NAN,
+};
+
 /// What makes a sample one of perfect sensors.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Corrections {
@@ -109,15 +119,6 @@ impl Corrections {
         let (aligned, present) = (waits(common), waits(encoder_delay.max(0.0)));
         let longest = aligned.torque.iter().fold(aligned.motor.max(aligned.link), |a, b| a.max(*b));
         let delayed = encoder_delay != 0.0 || delays.iter().any(|delay| *delay != 0.0);
-        let nothing = Sample {
-            sequence: 0,
-            motor_position: [f64::NAN; MOTORS],
-            motor_velocity: [f64::NAN; MOTORS],
-            motor_torque: [f64::NAN; MOTORS],
-            link_position: f64::NAN,
-            link_velocity: f64::NAN,
-            external_torque: f64::NAN,
-        };
         Ok(Corrections {
             period: period_s,
             active: delayed
@@ -133,7 +134,7 @@ impl Corrections {
             deflection: deflection_delay / period_s,
             first: None,
             last: 0,
-            past: vec![nothing; longest as usize + 2],
+            past: vec![NOTHING; longest as usize + 2],
             newest: 0,
             known: 0,
         })

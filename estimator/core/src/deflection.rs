@@ -225,17 +225,22 @@ impl DeflectionFilter {
         self.motion = motion;
     }
 
-    /// One step towards the steady-state gains.
-    pub fn tune(&mut self, tuning: &Tuning) {
-        let (t, w) = (self.period, self.w);
-        (self.inertia, self.damping) = (tuning.inertia, tuning.damping);
+    /// How large the motion is.
+    fn watch(&mut self, jerk: f64) {
         let rates = [self.x[1], self.x[1] + self.x[3]];
         let motion = &mut self.motion;
-        motion.jerk += self.average * (HIDDEN * tuning.jerk * tuning.jerk - motion.jerk);
+        motion.jerk += self.average * (HIDDEN * jerk * jerk - motion.jerk);
         motion.peak = (self.fade * motion.peak).max(motion.jerk);
         for (square, rate) in motion.squares.iter_mut().zip(rates) {
             *square += self.average * (rate * rate - *square);
         }
+    }
+
+    /// One step towards the steady-state gains.
+    pub fn tune(&mut self, tuning: &Tuning) {
+        let (t, w) = (self.period, self.w);
+        (self.inertia, self.damping) = (tuning.inertia, tuning.damping);
+        self.watch(tuning.jerk);
         let noise = tuning.motor_noise + tuning.link_noise;
         if !(noise > 0.0 && self.motion.peak > 0.0 && tuning.unmodelled < f64::INFINITY) {
             self.modelled = false; // the motor's balance is unknown: it cannot predict its motion
@@ -264,9 +269,13 @@ impl DeflectionFilter {
         before.iter_mut().flatten().for_each(|entry| *entry *= grown);
         (self.noise, self.wander) = (noise, density * natural.powi(6));
         let moved = self.moved(&before, c, drift * t, self.wander * t);
-        // Kalman gains for measured θ and φ = q − θ, whose noises share θ's.
+        self.correct(moved, tuning.motor_noise);
+    }
+
+    /// Kalman gains for measured θ and φ = q − θ, whose noises share θ's, from P before the readings.
+    fn correct(&mut self, moved: Covariance, motor_noise: f64) {
         let (s00, s01, s11) =
-            (moved[0][0] + tuning.motor_noise, moved[0][2] - tuning.motor_noise, moved[2][2] + noise);
+            (moved[0][0] + motor_noise, moved[0][2] - motor_noise, moved[2][2] + self.noise);
         let determinant = s00 * s11 - s01 * s01;
         if !(determinant > 0.0 && determinant < f64::INFINITY) {
             self.p = None;

@@ -23,7 +23,7 @@ use crate::filters::StateVariableFilter;
 use crate::joint_effects::JointEffects;
 use crate::laws::Law;
 use crate::library::ABSURD;
-use crate::model::{Arrangement, Link, Model, Transmission};
+use crate::model::{Arrangement, Link, Model, Motor, Transmission};
 use crate::sample::{MOTORS, Sample};
 use crate::settings::Settings;
 use crate::student::t_quantile;
@@ -49,6 +49,15 @@ pub struct Baseline {
     pub log_std: [f64; BALANCES],
     /// N.
     pub seconds: usize,
+}
+
+impl Baseline {
+    /// Of x, that a second of a sufficient model exceeds with this chance.
+    fn limit(&self, chance: f64) -> [f64; BALANCES] {
+        let n = self.seconds as f64;
+        let t = t_quantile((n - 1.0).max(1.0), 2.0 * chance); // the quantile's probability is that of both tails
+        self.log_std.map(|s| t * (s * s * (1.0 + 1.0 / n) + MOTION * MOTION).sqrt())
+    }
 }
 
 /// What was found in the last whole second.
@@ -85,6 +94,18 @@ struct MotorSide {
     damping: f64,
     flexible: bool,
     law: Option<(Law, Vec<f64>)>, // None: its torque is not known
+}
+
+impl MotorSide {
+    fn of(motor: &Motor) -> MotorSide {
+        let law = match &motor.transmission {
+            Transmission::Elastic { law, parameters, .. } if !parameters.is_empty() => {
+                Some((law.clone(), parameters.clone()))
+            }
+            _ => None,
+        };
+        MotorSide { inertia: motor.inertia, damping: motor.damping, flexible: motor.flexible(), law }
+    }
 }
 
 /// See the module.
@@ -139,31 +160,13 @@ impl ModelMonitor {
         period_s: f64,
     ) -> Result<ModelMonitor, Error> {
         model.check()?;
-        let motors: Vec<MotorSide> = (model.motors.iter())
-            .map(|motor| MotorSide {
-                inertia: motor.inertia,
-                damping: motor.damping,
-                flexible: motor.flexible(),
-                law: match &motor.transmission {
-                    Transmission::Elastic { law, parameters, .. } if !parameters.is_empty() => {
-                        Some((law.clone(), parameters.clone()))
-                    }
-                    _ => None,
-                },
-            })
-            .collect();
+        let motors: Vec<MotorSide> = model.motors.iter().map(MotorSide::of).collect();
         let linked = model.link.is_some() && model.has_deflection();
-        let balances = balances(model);
         let bandwidth = Settings::default().bandwidth; // whatever the estimator's is: a baseline is of one filter
         let narrow = StateVariableFilter::new(bandwidth.min(1.0 / (LIGHT * period_s)), period_s);
         let periods = |rad: f64| (rad / (narrow.bandwidth * period_s)).ceil() as u64;
-        let limit = baseline.map_or([f64::INFINITY; BALANCES], |baseline| {
-            let n = baseline.seconds as f64;
-            let chance = false_alarms_per_hour * WINDOW_S / 3600.0 / balances as f64;
-            // The quantile's probability is that of both tails.
-            let t = t_quantile((n - 1.0).max(1.0), 2.0 * chance);
-            baseline.log_std.map(|s| t * (s * s * (1.0 + 1.0 / n) + MOTION * MOTION).sqrt())
-        });
+        let chance = false_alarms_per_hour * WINDOW_S / 3600.0 / balances(model) as f64;
+        let limit = baseline.map_or([f64::INFINITY; BALANCES], |baseline| baseline.limit(chance));
         let mut made = ModelMonitor {
             flexible: model.has_deflection(),
             link: model.link,

@@ -170,17 +170,8 @@ impl SampleValidator {
 
     fn judge(&mut self, sample: &Sample) -> Accepted {
         let rejected = Accepted { status: status::INPUT_REJECTED, ..Accepted::default() };
-        let mut places = [0.0; PLACES];
-        places[..self.motors].copy_from_slice(&sample.motor_position[..self.motors]);
-        if self.flexible {
-            places[self.motors] = sample.link_position;
-        }
-        let size: f64 = places[..self.watched()].iter().map(|x| x.abs()).sum();
-        let impossible = size.is_nan() || size >= ABSURD;
-        if impossible {
-            let place = (0..self.watched())
-                .find(|i| places[*i].is_nan() || places[*i].abs() >= ABSURD)
-                .unwrap_or(self.motors);
+        let places = self.places(sample);
+        if let Some(place) = self.impossible(&places) {
             self.found = Some((self.signal(place), Reason::Impossible));
             return rejected;
         }
@@ -208,14 +199,8 @@ impl SampleValidator {
             if self.memory.rejected < self.patience {
                 return Accepted { frozen, ..rejected };
             }
-            let m = &self.memory;
-            let mut jumps = [0.0; PLACES];
-            for i in 0..self.watched() {
-                if m.astray[i] && m.runs[i] < PATIENCE - 2 {
-                    jumps[i] = places[i] - m.places[i] - periods as f64 * m.slopes[i];
-                }
-            }
-            return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, Some(jumps));
+            let jumps = Some(self.jumps(&places, periods as f64));
+            return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, jumps);
         }
         let m = &mut self.memory;
         (m.sequence, m.places) = (Some(sample.sequence), places);
@@ -230,6 +215,32 @@ impl SampleValidator {
             frozen,
             ..Accepted::default()
         }
+    }
+
+    fn places(&self, sample: &Sample) -> [f64; PLACES] {
+        let mut places = [0.0; PLACES];
+        places[..self.motors].copy_from_slice(&sample.motor_position[..self.motors]);
+        if self.flexible {
+            places[self.motors] = sample.link_position;
+        }
+        places
+    }
+
+    /// The first position that is no number or no place, if any.
+    fn impossible(&self, places: &[f64; PLACES]) -> Option<usize> {
+        let watched = &places[..self.watched()];
+        let size: f64 = watched.iter().map(|x| x.abs()).sum();
+        let is_none = |x: &f64| x.is_nan() || x.abs() >= ABSURD;
+        is_none(&size).then(|| watched.iter().position(is_none).unwrap_or(self.motors))
+    }
+
+    /// By how much each zero has moved, of those that have.
+    fn jumps(&self, places: &[f64; PLACES], periods: f64) -> [f64; PLACES] {
+        let (m, watched) = (&self.memory, self.watched());
+        std::array::from_fn(|i| {
+            let moved = i < watched && m.astray[i] && m.runs[i] < PATIENCE - 2;
+            if moved { places[i] - m.places[i] - periods * m.slopes[i] } else { 0.0 }
+        })
     }
 
     fn begin(

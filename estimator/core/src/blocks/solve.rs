@@ -138,23 +138,26 @@ impl Blocks {
         self.projection = Some(Projection::between(&self.family, self.deflection, low, high));
     }
 
+    /// Where the first blocks' iteration begins.
+    fn begin(&mut self, total: &Gram, torque: f64) {
+        if self.noise.variance.is_nan() {
+            self.noise.variance = 1e-4 * torque;
+        }
+        let few = self.ring.len() <= FEWEST && self.carried.is_none();
+        if self.spring.is_searched() && (few || !self.spring.known) {
+            self.start(total, self.noise.variance * self.correlated);
+        }
+        if few && !self.spring.is_anchored() && matches!(self.spring.law, Law::Polynomial | Law::Linear) {
+            self.start_by_deflection(total);
+        }
+    }
+
     /// The unknowns from all blocks.
     pub(super) fn solve(&mut self) {
         let mut total = Gram::default();
         self.ring.iter().for_each(|block| total.add(block, 1.0));
         let torque = balance::variance(&total, balance::TORQUE).max(f64::MIN_POSITIVE);
-        if self.noise.variance.is_nan() {
-            self.noise.variance = 1e-4 * torque;
-        }
-        if self.spring.is_searched()
-            && (!self.spring.known || self.ring.len() <= FEWEST && self.carried.is_none())
-        {
-            self.start(&total, self.noise.variance * self.correlated);
-        }
-        let fresh = self.ring.len() <= FEWEST && self.carried.is_none() && !self.spring.is_anchored();
-        if fresh && matches!(self.spring.law, Law::Polynomial | Law::Linear) {
-            self.start_by_deflection(&total);
-        }
+        self.begin(&total, torque);
         if !self.is_located(&total) {
             return;
         }

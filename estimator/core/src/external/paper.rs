@@ -91,6 +91,15 @@ impl PaperMomentum {
         self.unsettled = self.settle;
     }
 
+    /// Where y begins; without a measured velocity the momentum begins with the first difference.
+    fn begin(&mut self, sample: &Sample) -> External {
+        let measured = Some(sample.link_velocity).filter(|velocity| velocity.is_finite());
+        self.momentum.last = measured.map(|velocity| self.link.inertia * velocity);
+        self.damped.last = Some(self.link.damping * sample.link_position);
+        (self.fallen.last, self.pushed.last) = (Some(0.0), Some(0.0));
+        self.latest.repeat(sample.sequence)
+    }
+
     /// One sample that was used, so many periods after the last one.
     ///
     /// `internal`: r of eq 14 for the whole joint; `balance`: its y; `valid`: whether the estimate is.
@@ -107,12 +116,7 @@ impl PaperMomentum {
         let tau = if sample.external_torque.is_finite() { sample.external_torque } else { 0.0 };
         let g = gravity(&self.link, q);
         let Some(before) = self.last.replace([q, g, tau]) else {
-            // Where y begins; without a measured velocity the momentum begins with the first difference.
-            let measured = Some(sample.link_velocity).filter(|velocity| velocity.is_finite());
-            self.momentum.last = measured.map(|velocity| self.link.inertia * velocity);
-            self.damped.last = Some(self.link.damping * q);
-            (self.fallen.last, self.pushed.last) = (Some(0.0), Some(0.0));
-            return self.latest.repeat(sample.sequence);
+            return self.begin(sample);
         };
         let velocity =
             if sample.link_velocity.is_finite() { sample.link_velocity } else { (q - before[0]) / span };

@@ -3,6 +3,7 @@
 use super::{BALANCES, CHANNELS, EXTERNAL, LINK, ModelMonitor, TORQUE};
 use crate::effects::Coordinates;
 use crate::joint_effects::Torques;
+use crate::laws::Law;
 use crate::sample::{MOTORS, Sample};
 
 impl ModelMonitor {
@@ -10,34 +11,16 @@ impl ModelMonitor {
     pub(super) fn balance(&mut self) -> [f64; 2 * BALANCES] {
         let motors = self.motors.len();
         let [q, link_rate, link_acceleration] = self.channels[LINK];
-        let (mut each, mut torques) = ([Coordinates::default(); MOTORS], [0.0; MOTORS]);
-        let time = self.ticks as f64 * self.period;
         let at_link = Coordinates {
             link_position: q,
             link_velocity: link_rate,
             link_acceleration,
-            time,
+            time: self.ticks as f64 * self.period,
             ..Coordinates::default()
         };
-        for (i, side) in self.motors.iter().enumerate() {
-            let [theta, velocity, acceleration] = self.channels[i];
-            let [torque, torque_rate, _] = self.channels[TORQUE + i];
-            let phi = if side.flexible { q - theta } else { 0.0 };
-            let (flexibility, stiffness) = side.law.as_ref().map_or((0.0, 0.0), |(law, a)| law.at(phi, a));
-            torques[i] = flexibility;
-            each[i] = Coordinates {
-                position: theta,
-                velocity,
-                acceleration,
-                deflection: phi,
-                deflection_rate: if side.flexible { link_rate - velocity } else { 0.0 },
-                flexibility_torque: flexibility,
-                stiffness,
-                torque,
-                torque_rate,
-                ..at_link
-            };
-        }
+        let mut each = [Coordinates::default(); MOTORS];
+        each.iter_mut().take(motors).enumerate().for_each(|(i, c)| *c = self.coordinates(i, &at_link));
+        let torques = each.map(|c| c.flexibility_torque);
         let x: Torques = self.effects.torques(&each[..motors], &at_link);
         let mut raw = [0.0; 2 * BALANCES];
         let external = self.channels[EXTERNAL][0];
@@ -64,6 +47,32 @@ impl ModelMonitor {
             raw[0] += load(c.position, c.velocity, c.acceleration) + x.link - external;
         }
         raw
+    }
+
+    /// Those of a motor, beside those of the link.
+    fn coordinates(&self, i: usize, at_link: &Coordinates) -> Coordinates {
+        let side = &self.motors[i];
+        let [position, velocity, acceleration] = self.channels[i];
+        let [torque, torque_rate, _] = self.channels[TORQUE + i];
+        let (deflection, deflection_rate) = if side.flexible {
+            (at_link.link_position - position, at_link.link_velocity - velocity)
+        } else {
+            (0.0, 0.0)
+        };
+        let at = |(law, alpha): &(Law, Vec<f64>)| law.at(deflection, alpha);
+        let (flexibility_torque, stiffness) = side.law.as_ref().map_or((0.0, 0.0), at);
+        Coordinates {
+            position,
+            velocity,
+            acceleration,
+            deflection,
+            deflection_rate,
+            flexibility_torque,
+            stiffness,
+            torque,
+            torque_rate,
+            ..*at_link
+        }
     }
 
     pub(super) fn inputs_of(&self, sample: &Sample) -> [f64; CHANNELS] {

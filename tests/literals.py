@@ -58,7 +58,7 @@ REASONS: dict[str, dict[str, str]] = {
         "20.0": "third differences of white noise have 20 times its variance",
         "60.0": "periods in a recording, at least",
     },
-    "gate/usable.py": {"0.995": "share of values that stay: a sensor that is silent"},
+    "gate/usable.py": {"0.005": "share of values that change at most: a sensor that is silent"},
     "transmissions.py": {"41.0": "points at which a registered law is compared with its slope"},
     "core/src/balance.rs": {"6.4": "32/5: correlation time of white noise behind the filter"},
     "core/src/blocks.rs": {"0.98": "keeps the deflection inside the law's reach"},

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from estimator import (
+    EstimatorError,
     EstimatorSettings,
     JointModel,
     LinkDynamics,
@@ -21,6 +22,7 @@ from estimator import (
     make_estimator,
 )
 from estimator.diagnosis import diagnose
+from estimator.freerun import free_run
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 from world import simulate
@@ -155,3 +157,7 @@ def test_a_link_encoder_that_is_silent_shows_no_spring():
     silent = replace(moving, link_position_rad=np.full(len(moving), 0.3))
     (found,) = fit(silent, JointModel(arrangement="single", motors=(ELASTIC,)))
     assert not found.parameters
+    spring = Transmission(model="linear", parameters={"k_nm_rad": 120.0})
+    joint = JointModel(arrangement="single", motors=(replace(ELASTIC, transmission=spring),))
+    with pytest.raises(EstimatorError, match="expected a run without gaps"):
+        free_run(joints.part(silent, slice(1)), joint)  # one sample neither moves nor stands

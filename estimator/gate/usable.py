@@ -74,8 +74,8 @@ def _channel(name: str, x: FloatArray) -> None:
 
 def _stands(x: FloatArray) -> bool:
     """Whether a reading stays within a few counts, and on one of them nearly always."""
-    still = np.count_nonzero(np.diff(x) == 0.0) / (len(x) - 1)
-    return bool(still > 0.995 and len(np.unique(x)) < 4)
+    changes = np.count_nonzero(np.diff(x))
+    return bool(changes < 0.005 * (len(x) - 1) and len(np.unique(x)) < 4)
 
 
 def is_held(record: Record, model: JointModel) -> bool:

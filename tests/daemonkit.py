@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
@@ -89,13 +90,16 @@ class Collector:
 class DaemonRig:
     """Simulated devices and a daemon in one thread; nothing is published."""
 
-    def __init__(self, joint: JointFile, path: Path | None = None) -> None:
+    def __init__(self, joint: JointFile, path: Path | None = None, **options: Any) -> None:
         self.joint = joint
         self.bus = open_sim_bus(joint.bus)
         self.network: Network = network_from_joint(joint, self.bus)
         self.faults = Faults(self.network)
         self.daemon = Daemon(
-            [ServedJoint(joint=joint, path=path)], publish=False, real_time=False, devices=self.network.poll
+            [ServedJoint(joint=joint, path=path, **options)],
+            publish=False,
+            real_time=False,
+            devices=self.network.poll,
         )
         self.collector = Collector()
         (self.loop_joint,) = self.daemon.loop.loop_joints
@@ -129,8 +133,8 @@ class DaemonRig:
 
 
 @contextmanager
-def rig(joint: JointFile | None = None, path: Path | None = None) -> Iterator[DaemonRig]:
-    made = DaemonRig(joint or vsa(), path)
+def rig(joint: JointFile | None = None, path: Path | None = None, **options: Any) -> Iterator[DaemonRig]:
+    made = DaemonRig(joint or vsa(), path, **options)
     try:
         yield made
     finally:

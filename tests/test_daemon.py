@@ -1,6 +1,8 @@
 """The daemon's life: what it publishes, how it starts and ends, another model in the running loop."""
 
+import argparse
 import math
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -14,6 +16,7 @@ from daemonkit import Collector, DaemonRig, Listener, rig, running, served, vsa,
 from zenohkit import free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
+from drivelink.cli import moved
 from drivelink.cycle.startup import join_bus
 from drivelink.daemon import reload
 from drivelink.daemon.service import Daemon, ServedJoint
@@ -225,6 +228,50 @@ def test_a_flood_of_reloads_begins_one_in_a_while_and_forgets_none(reloadable, m
     while reloader._thread is not None:
         pass
     assert begun[-1] == now_s
+
+
+def taken(reloader: reload.Reloader) -> None:
+    """Have the joint file read, as far as the exchange."""
+    reloader._next_s = 0.0
+    reloader.check()
+    until(lambda: reloader._thread is None or reloader._ready is not None)
+
+
+def test_what_needs_a_restart_is_said_beside_what_the_daemon_was_started_with(tmp_path, monkeypatch):
+    monkeypatch.setattr(reload, "load_apart", load)
+    path, options = tmp_path / "elbow.toml", argparse.Namespace(interface=None, channel="elsewhere")
+    text = f'{vsa_text()}[recording]\nfolder = "kept"\n'
+    path.write_text(text, encoding="utf-8")
+    with rig(moved(load(path), options), path, move=partial(moved, args=options)) as made:
+        (reloader,) = made.daemon._reloaders
+        changed = text.replace('"kept"', '"box"').replace("node_id = 3", "node_id = 4")
+        for content in (changed, text):
+            path.write_text(content, encoding="utf-8")
+            taken(reloader)
+            until(lambda: made.run(20) and reloader._thread is None)
+        said = "elbow.toml: recording, link.encoder changed, which requires a restart of the daemon"
+        assert made.events == [said, IN_USE]
+
+
+def test_a_joint_file_that_is_gone_or_none_leaves_the_model_as_it_is(reloadable, tmp_path, monkeypatch):
+    monkeypatch.setattr(reload, "load_apart", load)
+    made, path, before = reloadable, tmp_path / "elbow.toml", (tmp_path / "elbow.toml").read_bytes()
+    (reloader,) = made.daemon._reloaders
+    old = made.loop_joint.pipeline.estimator
+    path.unlink()
+    taken(reloader)
+    path.mkdir()
+    taken(reloader)
+    path.rmdir()
+    for content in (b"", os.urandom(999), before + b"#" + bytes(300 << 10), before[: len(before) // 2]):
+        path.write_bytes(content)
+        taken(reloader)
+        assert len(made.run(20)) == 20 and made.loop_joint.pipeline.estimator is old
+    assert len(made.events) == 6
+    assert all(text.startswith("the model stays as it is: ") and "elbow.toml" in text for text in made.events)
+    path.write_bytes(before)
+    taken(reloader)
+    until(lambda: made.run(20) and made.loop_joint.pipeline.estimator is not old)
 
 
 SINGLE = """

@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -64,14 +65,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve the joints until stopped."""
     _set_up_logging(args.log_level)
-    loaded = [moved(load(path), args) for path in args.joints]
+    move = partial(moved, args=args)
+    loaded = [move(load(path)) for path in args.joints]
     if loaded[0].bus.interface == "virtual":
         logging.getLogger(__name__).warning(ALONE)
     from drivelink.cli.blackbox import black_box
     from drivelink.daemon.service import Daemon, ServedJoint  # takes a second: after the joint files
     from drivelink.pubsub.publisher import to_json
 
-    joints = [ServedJoint(joint=joint, path=path) for joint, path in zip(loaded, args.joints, strict=True)]
+    joints = [
+        ServedJoint(joint=joint, path=path, move=move)
+        for joint, path in zip(loaded, args.joints, strict=True)
+    ]
     with (
         _stopped_by_signals() as stopped,
         ExitStack() as stack,

@@ -31,13 +31,13 @@ _PAUSE_S = 0.0005
 _BEHIND = 4  # samples that the cycle can process at the exchange
 _PATIENCE = 4000  # slacks until the cycle takes over; usually a few hundred suffice
 _AID = 2  # steps per slack from then on
-_FIXED = ("name", "arrangement", "bus", "zenoh")  # keys that a running daemon cannot change
 
 
 class Reloader:
     """Watches one joint file and exchanges the estimator of its pipeline.
 
     Args:
+        move: puts a joint file on the bus of the command line.
         build: makes estimator and model monitor of a joint file; called in a thread.
         publish: called with the new joint file after an exchange.
     """
@@ -47,14 +47,15 @@ class Reloader:
         path: Path,
         joint: JointFile,
         pipeline: JointPipeline,
+        move: Callable[[JointFile], JointFile],
         build: Callable[[JointFile], Built],
         publish: Callable[[JointFile], None],
         events: EventLog,
     ) -> None:
         self.path = path
-        self._joint = joint
+        self._joint, self._fixed = joint, _fixed(joint)
         self._pipeline, self._history = pipeline, pipeline.history
-        self._build = build
+        self._move, self._build = move, build
         self._publish = publish
         self._events = events
         self._seen = self._signature()
@@ -79,7 +80,7 @@ class Reloader:
         if self._thread is not None or time.monotonic() < self._next_s:
             return
         signature = self._signature()
-        if (signature == self._seen or signature is None) and not self._requested:
+        if signature == self._seen and not self._requested:
             return
         self._seen, self._requested, self._slacks = signature, False, 0
         self._next_s = time.monotonic() + _EVERY_S
@@ -115,7 +116,7 @@ class Reloader:
 
     def _prepare(self) -> None:
         try:
-            joint = load_apart(self.path)
+            joint = self._move(load_apart(self.path))
             self._refuse_changes(joint)
             built = self._build(joint)
         except (DrivelinkError, EstimatorError) as error:
@@ -140,12 +141,7 @@ class Reloader:
         self._ready = (joint, built, self._pipeline.warm(built[0], sequence, steps))
 
     def _refuse_changes(self, joint: JointFile) -> None:
-        changed = [key for key in _FIXED if getattr(joint, key) != getattr(self._joint, key)]
-        changed += [
-            f"motor[{n}].drive"
-            for n, (new, old) in enumerate(zip(joint.motor, self._joint.motor, strict=False), 1)
-            if new.drive != old.drive
-        ]
+        changed = [key for key, value in _fixed(joint).items() if self._fixed.get(key) != value]
         if changed:
             self._events.report(
                 f"{self.path.name}: {', '.join(changed)} changed, which requires a restart of the daemon",
@@ -153,3 +149,10 @@ class Reloader:
             )
         if joint.arrangement != self._joint.arrangement:
             raise DrivelinkError(f"arrangement: expected {self._joint.arrangement}, as it was at the start")
+
+
+def _fixed(joint: JointFile) -> dict[str, object]:
+    """What a running daemon cannot change, by key."""
+    keys = ("name", "arrangement", "bus", "zenoh", "recording")
+    drives = {f"motor[{n}].drive": motor.drive for n, motor in enumerate(joint.motor, 1)}
+    return {key: getattr(joint, key) for key in keys} | drives | {"link.encoder": joint.link.encoder}

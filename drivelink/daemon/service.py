@@ -11,7 +11,7 @@ import logging
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,7 @@ class ServedJoint:
 
     joint: JointFile
     path: Path | None = None  # its path; None: it cannot be reloaded and refers to no other files
+    move: Callable[[JointFile], JointFile] = lambda joint: joint  # to the bus of the command line
 
     @property
     def folder(self) -> Path:
@@ -143,8 +144,7 @@ class Daemon:
         self.events.report(f"{text}: estimates begin anew with it", logging.WARNING)
         present = {reloader.path: reloader.close() for reloader in self._reloaders}
         self._joints = tuple(
-            ServedJoint(joint=present[one.path], path=one.path) if one.path in present else one
-            for one in self._joints
+            replace(one, joint=present[one.path]) if one.path in present else one for one in self._joints
         )
         known = self._configurator.layouts
         served = [roles(one.joint, one.folder) for one in self._joints]
@@ -266,6 +266,7 @@ class Daemon:
                 served.path,
                 served.joint,
                 loop_joint.pipeline,
+                served.move,
                 lambda joint: build(self._timed(joint)),
                 self._republish(publisher, mine),
                 self.events,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import difflib
 import logging
 import os
 import shutil
@@ -10,6 +11,7 @@ import sys
 import textwrap
 import time
 import unicodedata
+from collections.abc import Collection
 from typing import TextIO
 
 MAX_TEXT = 4096  # characters of one text
@@ -23,6 +25,12 @@ def clean_text(text: str, length: int = MAX_TEXT) -> str:
     if not text.isascii() or not text.isprintable():
         text = "".join(_shown(character) for character in text)
     return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def expected(name: str, known: Collection[str]) -> str:
+    """Return what was expected instead of an unknown name: the nearest, or one of all."""
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
 
 
 def _shown(character: str) -> str:

@@ -356,7 +356,8 @@ def test_an_effect_is_written_name_value_and_further_parameters():
     [
         ("coulomb_friction", "expected NAME=VALUE"),
         ("coulomb_friction=", "expected NAME=VALUE"),
-        ("colomb=1", "expected one of coulomb_friction"),
+        ("magic=1", 'expected one of coulomb_friction.*; got "magic"'),
+        ("colomb_friction=1", r'did you mean coulomb_friction\? got "colomb_friction"'),
         ("coulomb_friction=much", 'expected a number, got "much"'),
         ("coulomb_friction=nan", "expected a finite number"),
         ("coulomb_friction=1,torque=3", "unknown parameter, expected torque_nm"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import hashlib
 import json
 import logging
@@ -22,6 +21,7 @@ from tomlkit.container import Container
 from drivelink.errors import JointFileError
 from drivelink.files import read_regular, write_whole
 from drivelink.jointfile.schema import JointFile
+from drivelink.plaintext import expected
 from estimator.model import Effect, JointModel, Motor, ParameterValue
 
 _DIGITS = 9  # of a covariance
@@ -80,10 +80,7 @@ def unknown_key(root: type, location: tuple[int | str, ...]) -> str:
         if isinstance(part, str):
             section = _table(_keys(section).get(part))
     known = list(_keys(section))
-    close = difflib.get_close_matches(str(location[-1]), known, n=1)
-    if close:
-        return f"unknown key, did you mean {close[0]}?"
-    return f"unknown key, expected one of {', '.join(known)}" if known else "unknown key"
+    return f"unknown key, {expected(str(location[-1]), known)}" if known else "unknown key"
 
 
 def _keys(section: Any) -> dict[str, Any]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from annotated_types import Gt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from drivelink.jointfile.columns import COLUMNS, si_factor
-from estimator.effects import elements
+from drivelink.plaintext import expected
+from estimator.effects import LIBRARY, elements
 from estimator.model import (
     Arrangement,
     Effect,
@@ -26,6 +27,17 @@ from estimator.transmissions import transmission_model
 
 Direction = Literal[1, -1]
 MOST_EFFECTS = 32  # of a motor or the link: each costs time in every cycle
+
+
+def _known(effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
+    for effect in effects:
+        if effect.name not in LIBRARY:
+            raise ValueError(f'effect "{effect.name}": {expected(effect.name, sorted(LIBRARY))}')
+        elements(effect)
+    return effects
+
+
+_Effects = Annotated[tuple[Effect, ...], AfterValidator(_known)]
 
 
 class _Section(BaseModel):
@@ -150,16 +162,12 @@ class MotorSection(_Section):
     transmission: Transmission = Field(
         default_factory=Transmission, description="model of the flexibility torque"
     )
-    effect: tuple[Effect, ...] = Field(
-        (), max_length=MOST_EFFECTS, description="effects the model has been given"
-    )
+    effect: _Effects = Field((), max_length=MOST_EFFECTS, description="effects the model has been given")
     drive: DriveSection | None = Field(None, description="needed by run, sim, record and doctor")
 
     @model_validator(mode="after")
     def _parameters_can_be(self) -> MotorSection:
         transmission_model(self.transmission)
-        for effect in self.effect:
-            elements(effect)
         return self
 
     def motor(self) -> Motor:
@@ -183,15 +191,7 @@ class LinkSection(_Section):
     dynamics: LinkDynamics | None = Field(
         None, description="needed for the external torque and residual (eq 12)"
     )
-    effect: tuple[Effect, ...] = Field(
-        (), max_length=MOST_EFFECTS, description="effects at the link or in its encoder"
-    )
-
-    @model_validator(mode="after")
-    def _effects_can_be(self) -> LinkSection:
-        for effect in self.effect:
-            elements(effect)
-        return self
+    effect: _Effects = Field((), max_length=MOST_EFFECTS, description="effects at the link or in its encoder")
 
 
 class BusSection(_Section):

@@ -9,6 +9,7 @@ independent.
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -51,7 +52,10 @@ def make(name: str, parameters: Mapping[str, object], motor: int | None = None) 
     """
     definition = LISTED.get(name) or UNLISTED.get(name)
     if definition is None:
-        raise SimError(f'effect: expected one of {", ".join((*LISTED, *UNLISTED))}; got "{name}"')
+        known = (*LISTED, *UNLISTED)
+        close = difflib.get_close_matches(name, known, n=1)
+        guess = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)};"
+        raise SimError(f'effect: {guess} got "{name}"')
     given = {key: _number(f"{name}.{key}", value) for key, value in parameters.items()}
     which = given.pop("motor", 1.0 + (motor or 0))
     if which not in (1.0, 2.0):

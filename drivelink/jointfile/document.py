@@ -220,15 +220,26 @@ def write_model(
     Raises:
         JointFileError: the result is invalid, or the target cannot be written.
     """
-    document = tomlkit.parse(without_check(source.text))
+    before = without_check(source.text)
+    document = tomlkit.parse(before)
     _merge(document, changes)
-    text = _checked(tomlkit.dumps(document))
+    text = _checked(_apart(tomlkit.dumps(document), before))
     joint = parse(text, str(target))
     try:
         write_whole(target, text, force=force)
     except OSError as error:
         raise JointFileError(f"{target}: cannot be written: {error.strerror}") from error
     return joint
+
+
+def _apart(text: str, before: str) -> str:
+    """Separate what is new from the table after it by a blank line, which tomlkit does not."""
+    known, lines = set(before.split("\n")), [""]
+    for line in text.split("\n"):
+        if line.startswith("[") and lines[-1].strip() and not {line, lines[-1]} <= known:
+            lines.append("")
+        lines.append(line)
+    return "\n".join(lines[1:])
 
 
 def _checked(text: str) -> str:

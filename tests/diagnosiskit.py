@@ -38,7 +38,10 @@ class World:
         def controller(k: int, x: FloatArray) -> FloatArray:
             return 170.0 * (reference[k] - x[:, :1]) + 6.0 * (rate[k] - x[:, 1:2])
 
-        truth = joints.simulate(self._plants(m), controller, PERIOD_S, 2, size=(n, m, 1), method=joints.HEUN)
+        plants = self._plants(m)
+        substeps = 1 if plants.more is None else 2
+        size = (n, m, 1)
+        truth = joints.simulate(plants, controller, PERIOD_S, substeps, size=size, method=joints.HEUN)
         rows = np.stack([truth.theta[..., 0], truth.tau[..., 0], truth.q], axis=1)
         self.records = [self._measured(rows[:, :, j], self.effects[j], rng) for j in range(m)]
         return self.records
@@ -56,7 +59,7 @@ class World:
             memories=1,
         )
 
-    def _more(self, inertia: FloatArray) -> joints.More:
+    def _more(self, inertia: FloatArray) -> joints.More | None:
         names = (
             "coulomb_nm offset_nm cogging_nm second_nm fading_nm bump_nm constant ripple link_nm push_nm "
             "hysteresis_nm"
@@ -86,11 +89,10 @@ class World:
                 link = link - v["link_nm"] * link_w / np.sqrt(link_w * link_w + 4e-6)
             if "push_nm" in on:
                 link = link + v["push_nm"] * sum(np.exp(-(((t - at) / 0.15) ** 2)) for at in PUSHES_S)
-            if on:
-                out[:, 1] += motor / inertia
-                out[:, 3] += link / LINK_INERTIA
+            out[:, 1] += motor / inertia
+            out[:, 3] += link / LINK_INERTIA
 
-        return more
+        return more if on else None
 
     def _reference(self, n: int, rng: np.random.Generator) -> FloatArray:
         time = np.arange(n) * PERIOD_S

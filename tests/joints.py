@@ -1,6 +1,6 @@
 """Truth for the estimator's tests: many joints at once, by an integrator that sim/ does not use.
 
-Dormand-Prince's fifth-order step, fixed, with the torque held over each period as a drive holds it. All
+The classical fourth-order step, fixed, with the torque held over each period as a drive holds it. All
 arrays carry the joint as their first axis, so a hundred random joints cost what one does.
 """
 
@@ -17,36 +17,28 @@ from estimator import EstimatorSettings, JointModel, Motor, Record, Transmission
 
 Array = np.ndarray
 
-# (nodes, rows, weights) of explicit Runge-Kutta methods.
-Method = tuple[tuple[float, ...], list[Array], Array]
-DORMAND_PRINCE: Method = (
-    (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0),
-    [np.array(row) for row in (
-        (1 / 5,), (3 / 40, 9 / 40), (44 / 45, -56 / 15, 32 / 9),
-        (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-        (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-    )],
-    np.array((35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)),
-)  # fmt: skip
-HEUN: Method = ((0.0, 1.0), [np.array((1.0,))], np.array((0.5, 0.5)))
+# (nodes, weights) of explicit Runge-Kutta methods whose stages each begin with the slope of the one before.
+Method = tuple[tuple[float, ...], Array]
+CLASSICAL: Method = ((0.0, 0.5, 0.5, 1.0), np.array((1 / 6, 1 / 3, 1 / 3, 1 / 6)))
+HEUN: Method = ((0.0, 1.0), np.array((0.5, 0.5)))
 
 
 def polynomial(coefficients: Array) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
     """(torque, stiffness) for coefficients (N, m, p), phi (N, m)."""
-    alpha = np.moveaxis(coefficients, -1, 0)
-    odd = 2 * np.arange(len(alpha)) + 1
+    alpha = list(np.moveaxis(coefficients, -1, 0))
+    slopes = [(2 * k + 1) * a for k, a in enumerate(alpha)]
 
     def even(by_power: list[Array], phi: Array) -> Array:
-        square, total = phi * phi, by_power[-1]
+        square, total = phi * phi if len(alpha) > 1 else 0.0, by_power[-1]
         for coefficient in by_power[-2::-1]:
             total = coefficient + square * total
         return total
 
     def torque(phi: Array) -> Array:
-        return phi * even(list(alpha), phi)
+        return phi * even(alpha, phi)
 
     def stiffness(phi: Array) -> Array:
-        return even([k * a for k, a in zip(odd, alpha, strict=True)], phi) + 0.0 * phi
+        return even(slopes, phi) + 0.0 * phi
 
     return torque, stiffness
 
@@ -110,7 +102,7 @@ def simulate(
     substeps: int | None = None,
     *,
     size: tuple[int, int, int] | None = None,
-    method: Method = DORMAND_PRINCE,
+    method: Method = CLASSICAL,
 ) -> Truth:
     """Integrate from rest; row k of tau (n, N, m) is held from t_k to t_(k+1).
 
@@ -123,25 +115,31 @@ def simulate(
     if substeps is None:
         eigen = np.sqrt(plants.stiffness(np.zeros((N, m))) * (1 / B + 1 / np.reshape(M, (-1, 1))))
         substeps = 2 if dry or np.max(eigen) * period_s > 0.1 else 1
-    nodes, rows, weights = method
     h, width = period_s / substeps, 2 * m + 2 + plants.memories
+    nodes, weights = method[0], h * method[1]
     x, stages = np.zeros((N, width)), np.zeros((len(nodes), N, width))
-    flat = stages.reshape(len(nodes), -1)
-    theta, omega, q, dq = x[:, :m], x[:, m : 2 * m], x[:, 2 * m], x[:, 2 * m + 1]
+    flat, dry_nm, load_rate = stages.reshape(len(nodes), -1), plants.coulomb, -1.0 / M
+    (theta, omega, q, dq), *slopes = (
+        (of[:, :m], of[:, m : 2 * m], of[:, 2 * m], of[:, 2 * m + 1]) for of in (x, *stages)
+    )
+    across = x[:, 2 * m : 2 * m + 1]
     states, held = np.empty((n, N, width)), np.empty((n, N, m))
     scales = np.where(np.arange(n) * period_s >= plants.scale_at[0], plants.scale_at[1], 1.0)
 
-    def rate(t: float, scale: float, u: Array, out: Array) -> None:
-        spring = scale * plants.torque(q[:, None] - theta)
-        out[:, :m] = omega
+    def rate(t: float, scale: float, u: Array, stage: int) -> None:
+        theta_out, omega_out, q_out, dq_out = slopes[stage]
+        spring = plants.torque(across - theta)
+        if scale != 1.0:
+            spring = scale * spring
+        theta_out[:], q_out[:] = omega, dq
         push = u + spring - D * omega
         if dry:
-            push = push - plants.coulomb * np.tanh(omega / 1e-3)
-        out[:, m : 2 * m] = push / B
-        out[:, 2 * m] = dq
-        out[:, 2 * m + 1] = -(spring.sum(1) + Dq * dq + gravity * np.sin(q)) / M
+            push -= dry_nm * np.tanh(omega / 1e-3)
+        np.divide(push, B, out=omega_out)
+        load = (spring[:, 0] if m == 1 else spring.sum(1)) + Dq * dq + gravity * np.sin(q)
+        np.multiply(load, load_rate, out=dq_out)
         if plants.more is not None:
-            plants.more(t, x, out, u)
+            plants.more(t, x, stages[stage], u)
 
     for k in range(n):
         states[k] = x
@@ -150,9 +148,9 @@ def simulate(
             before, start = x.copy(), k * period_s + step * h
             for i, node in enumerate(nodes):
                 if i:
-                    x[:] = before + h * (rows[i - 1] @ flat[:i]).reshape(N, width)
-                rate(start + node * h, scales[k], u, stages[i])
-            x[:] = before + h * (weights @ flat).reshape(N, width)
+                    np.add(before, node * h * stages[i - 1], out=x)
+                rate(start + node * h, scales[k], u, i)
+            np.add(before, (weights @ flat).reshape(N, width), out=x)
     q, phi, scales = states[..., 2 * m], states[..., 2 * m, None] - states[..., :m], scales[:, None, None]
     motors, q_rate = (states[..., :m], states[..., m : 2 * m]), states[..., 2 * m + 1]
     return Truth(*motors, q, q_rate, held, scales * plants.torque(phi), scales * plants.stiffness(phi))

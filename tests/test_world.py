@@ -62,7 +62,7 @@ EXACT = "motor_counts=0 link_bits=0 seconds=3"
 def test_the_joint_without_effects_is_that_of_another_integrator(spring, law):
     c = simulated(f"{spring} {EXACT}").columns
     plants = joints.Plants(*law, 0.12, 0.8, 0.45, 0.5, 3.0)
-    truth = joints.simulate(plants, c["motor1_torque_nm"][:, None, None], 1e-3)
+    truth = joints.simulate(plants, c["motor1_torque_nm"][:, None, None], 1e-3, 4)
     for name, expected in (
         ("motor1_position_rad", truth.theta),
         ("link_position_rad", truth.q),

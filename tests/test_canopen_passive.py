@@ -31,7 +31,7 @@ def passive(text_drive, base=None):
     ("drive", "said"),
     [
         (STATED + MAP.replace(', "0x6077:00:16"', ""), r"node 5 .* sends no motor_torque: TPDO0 = 0x6041:00 \+ 0x6064:00"),
-        (STATED, r"its mapping is not known.*motor\.drive\.tpdo.*eds.*before the master"),
+        (STATED, r"its mapping is not known: expected its master to write.*motor\.drive\.tpdo.*eds"),
         ("rated_torque_nm = 0.8" + MAP, "counts_per_rev"),
     ],
 )  # fmt: skip
@@ -237,7 +237,7 @@ def test_a_data_sheets_map_is_offered_and_not_believed(tmp_path):
 
 def test_what_a_recorder_lacks_without_a_daemon_is_the_daemon():
     configurator = PassiveConfigurator([parse(joint_text(drive=STATED))])
-    assert "or start drivelink run, which configures the drives" in str(configurator.missing[5])
+    assert "expected drivelink run to write it" in str(configurator.missing[5])
 
 
 def test_frames_that_are_heard_of_a_node_whose_map_is_unknown_are_named():

@@ -15,6 +15,7 @@ from canopenkit import joint_text
 from drivelink._core import LATE
 from drivelink.cycle.startup import BusPort, join_bus
 from drivelink.cycle.syncclock import SyncClock, measure_period
+from drivelink.errors import DriveError
 from drivelink.jointfile import parse
 
 DRIVE = """counts_per_rev = 16384
@@ -46,6 +47,27 @@ def joined(period_s: float, bus: str):
     joint = parse(joint_text(drive=DRIVE, bus=f'configure = false\nsync = "follow"\n{bus}'))
     configurator, _ = join_bus(BusPort(Playing(period_s)), [joint], [Path()])
     return configurator.bus.period_s
+
+
+HEARD = "heard in 0.1 s: 2 SYNC, 1 heartbeats (pre-operational), no SDO requests to it, no PDOs of it"
+
+
+@pytest.mark.parametrize(
+    ("drive", "said"),
+    [
+        (DRIVE, f"node 5: expected frame 0x185 on SYNC; {HEARD}: has its master mapped and started it?"),
+        (DRIVE.partition("[[")[0], f"or eds in the joint file; {HEARD}"),
+    ],
+)
+def test_what_was_heard_of_a_node_that_its_master_has_not_mapped_yet_is_said(drive, said):
+    joint = parse(joint_text(drive=drive, bus='configure = false\nsync = "follow"\n'))
+    bus = Playing(0.001)
+    sent = [(0x080, b""), (0x705, b"\x7f"), (0x080, b"")]
+    messages = [can.Message(arbitration_id=one, data=data, is_extended_id=False) for one, data in sent]
+    bus._frames = itertools.chain(messages, itertools.repeat(None))
+    with pytest.raises(DriveError) as caught:
+        join_bus(BusPort(bus), [joint], [Path()], patience_s=0.1)
+    assert str(caught.value).endswith(said)
 
 
 WRONG = (

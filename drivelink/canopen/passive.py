@@ -242,11 +242,10 @@ class _PassiveNode:
             return self.doubt()
         heard = ", ".join(f"0x{cob_id:03X} ({length} bytes)" for cob_id, length in sorted(self.heard.items()))
         # With `configure` only a recorder listens, beside the daemon that is to write the mapping.
-        late = "start drivelink before the master configures the drives"
-        help_ = "start drivelink run, which configures the drives" if self._bus.configure else late
+        master = "drivelink run" if self._bus.configure else "its master"
         return (
-            f"{role.subject} ({role.key}): its mapping is not known: give {self._keys()} or eds in the joint "
-            f"file, or {help_}"
+            f"{role.subject} ({role.key}): its mapping is not known: expected {master} to write it or read "
+            f"it back while this listens, or {self._keys()} or eds in the joint file"
         ) + (f"; it sends {heard}" if heard else "")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import can
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.bus import Idle, frames, is_canopen
 from drivelink.canopen.configure import Configurator, configure_joints, refuse_foreign_sync
+from drivelink.canopen.emcy import nmt_state
 from drivelink.canopen.layout import NodeLayout, roles
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.loop import CycleLoop
@@ -116,11 +118,14 @@ def _listen(port: BusPort, passive: PassiveConfigurator, idle: Idle | None, pati
     """Listen until the mapping of every node is known."""
     if not passive.busy:
         return
+    heard = _Heard()
     for cob_id, data, _ in _frames(port, idle, patience_s):
+        heard.feed(cob_id, data)
         _overhear(passive, cob_id, data)
         if not passive.busy:
             return
-    raise next(iter(passive.missing.values()))
+    node, missing = next(iter(passive.missing.items()))
+    raise DriveError(f"{missing}; {heard.of(node, patience_s)}")
 
 
 def _overhear(passive: PassiveConfigurator, cob_id: int, data: bytes) -> bool:
@@ -131,12 +136,35 @@ def _overhear(passive: PassiveConfigurator, cob_id: int, data: bytes) -> bool:
     return bool(passive.poll(now_s))
 
 
+class _Heard:
+    """Counts the frames that come while a node is waited for."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[int] = Counter()
+        self._states: dict[int, str] = {}
+
+    def feed(self, cob_id: int, data: bytes) -> None:
+        self._counts[cob_id] += 1
+        if cob_id >> 7 == 0x700 >> 7 and len(data) == 1:
+            self._states[cob_id & 0x7F] = f" ({nmt_state(data[0] & 0x7F)})"
+
+    def of(self, node: int, seconds: float) -> str:
+        """Return what was heard of a node."""
+        counts, state = self._counts, self._states.get(node, "")
+        pdos = sum(counts[base + node] for base in range(0x180, 0x580, 0x100))
+        kinds = {"SYNC": counts[SYNC_COB_ID], f"heartbeats{state}": counts[0x700 + node]}
+        kinds |= {"SDO requests to it": counts[0x600 + node], "PDOs of it": pdos}
+        parts = ", ".join(f"{number or 'no'} {kind}" for kind, number in kinds.items())
+        return f"heard in {seconds:g} s: {parts}"
+
+
 class _Expected:
     """Frames required before the loop runs: SYNC, and the answers of every node."""
 
     def __init__(self, channel: str, layouts: Iterable[NodeLayout], synced: bool = False) -> None:
         self.channel = channel
         self.synced = synced
+        self.heard = _Heard()
         self._frames = {
             tpdo.cob_id: (layout.node_id, tpdo.length)
             for layout in layouts
@@ -149,6 +177,7 @@ class _Expected:
         return self.synced and not self._frames
 
     def feed(self, cob_id: int, data: bytes) -> None:
+        self.heard.feed(cob_id, data)
         if cob_id == SYNC_COB_ID:
             self.synced = True
         elif cob_id in self._frames and self.synced:
@@ -167,8 +196,8 @@ class _Expected:
             )
         cob_id, (node, _) = next(iter(self._frames.items()))
         return DriveError(
-            f"node {node}: no frame 0x{cob_id:03X} in {patience_s:g} s of SYNC: "
-            "is it powered, operational, and does it send this PDO on SYNC?"
+            f"node {node}: expected frame 0x{cob_id:03X} on SYNC; {self.heard.of(node, patience_s)}: "
+            "has its master mapped and started it?"
         )
 
 

@@ -32,6 +32,7 @@ from drivelink.monitor.webaccept import TOKEN_HEADER, WebAcceptance
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.ros2 import Ros2Publisher
 from drivelink.recording.sinks import McapSink
+from estimator.reasons import percent
 from estimator.sample import Sample
 from sim.world import record
 
@@ -111,6 +112,7 @@ def test_where_nothing_has_changed_nothing_is_proposed(tmp_path):
     made = recorded(tmp_path)
     found = diagnosing.make(made)
     assert (found["state"], found["since"]) == (finding.NOTHING, None)
+    assert f"leaves, {percent(found['error']['after_relative'], 2)} of the torque" in found["sentence"]
     assert not proposal_file(made).exists()
     finding.write(made, found)
     with pytest.raises(RecordingError, match="nothing to accept: The model is sufficient"):

@@ -44,11 +44,12 @@ class Summary(NamedTuple):
     parameters: tuple[str, ...]
 
 
-def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
+def summary(outcome: Diagnosis, error: Errors, joint: JointFile, better: bool) -> Summary:
     """Describe what was found.
 
     Args:
-        error: of the model in use and of the proposed one, on held-out data.
+        error: before and after, on held-out data.
+        better: whether the joint file with what was found is worth proposing.
     """
     units = Units(joint.axis == "linear")
     fall = f"{percent(error.before_relative, 2)} to {percent(error.after_relative, 2)}"
@@ -57,7 +58,7 @@ def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
         names = " and ".join(sentences.title_of(one, outcome) for one in outcome.effects)
         how = "falls" if error.after_rms_nm < error.before_rms_nm else "does not fall, but goes"
         sentence, short = f"{sentences.lacks(outcome)}: {on} {how} from {fall}.", f"{names}, error {fall}"
-    elif outcome.verdict == "sufficient" and error.after_rms_nm < 0.5 * error.before_rms_nm:
+    elif outcome.verdict == "sufficient" and better:
         sentence = f"No effect is missing, but the joint has changed: refitted, {on} falls from {fall}."
         short = f"the joint has changed, error {fall}"
     else:
@@ -129,9 +130,12 @@ def make(recording: Path) -> dict[str, Any]:
     trained, held = part.rows(part.sequence < held_from), part.rows(part.sequence >= held_from)
     outcome = diagnose(trained, model, None, held)
     change = _change(part, source.joint, outcome)
-    error, state = _error(part, source.joint, change, held_from), finding.NOTHING
-    said, harmful = summary(change, error, source.joint), None
-    if error.after_rms_nm < error.before_rms_nm and _has_changed(part, source.joint, change):
+    error, state, harmful = _error(part, source.joint, change, held_from), finding.NOTHING, None
+    better = error.after_rms_nm < error.before_rms_nm and _has_changed(part, source.joint, change)
+    if not better and change.verdict != "effect":
+        error = change.validation  # which the sentence is about
+    said = summary(change, error, source.joint, better)
+    if better:
         proposed = apply_diagnosis.diagnosed_model(source.joint, change)
         harmful = harm(model, proposed, [Unseen(part, held_from)], source.joint.estimator)
         if harmful is None:

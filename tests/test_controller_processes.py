@@ -22,6 +22,15 @@ def reaches(events: list[dict], phase: str, after: int = 0) -> dict:
     return next(event for event in events[after:] if event["phase"] == phase)
 
 
+def test_without_a_bus_the_controller_is_one_line(tmp_path):
+    path, port = tmp_path / "vsa.toml", free_port()
+    path.write_text((kit.EXAMPLE / "joint.toml").read_text(encoding="utf-8").replace("29536", str(port)))
+    done = subprocess.run([sys.executable, kit.EXAMPLE / "run.py", path], capture_output=True, text=True)
+    said = f"socketcand 127.0.0.1:{port} cannot be opened: nobody listens there"
+    assert done.returncode == 1 and done.stderr.splitlines()[-1] == f"run.py: {said}"
+    assert "Traceback" not in done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_killed_daemon_and_the_way_back_in_three_processes(tmp_path):

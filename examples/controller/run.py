@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import signal
 import sys
 import time
@@ -28,7 +29,7 @@ from drives import Master
 from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.cycle import realtime
-from drivelink.errors import ZenohError
+from drivelink.errors import DrivelinkError, ZenohError
 from drivelink.pubsub.client import Subscription, subscribe
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.pubsub.wire import decode_sample
@@ -116,4 +117,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # socketcand logs every partial read
+    try:
+        main()
+    except DrivelinkError as error:
+        sys.exit(f"run.py: {error}")

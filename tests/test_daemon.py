@@ -263,11 +263,18 @@ def test_a_joint_file_that_is_gone_or_none_leaves_the_model_as_it_is(reloadable,
     path.mkdir()
     taken(reloader)
     path.rmdir()
-    for content in (b"", os.urandom(999), before + b"#" + bytes(300 << 10), before[: len(before) // 2]):
+    named = before.replace(b'"elbow"', b'"wrist"')
+    for content in (
+        b"",
+        os.urandom(999),
+        before + b"#" + bytes(300 << 10),
+        before[: len(before) // 2],
+        named,
+    ):
         path.write_bytes(content)
         taken(reloader)
         assert len(made.run(20)) == 20 and made.loop_joint.pipeline.estimator is old
-    assert len(made.events) == 6
+    assert len(made.events) == 7 and "name: expected elbow, as it was at the start" in made.events[-1]
     assert all(text.startswith("the model stays as it is: ") and "elbow.toml" in text for text in made.events)
     path.write_bytes(before)
     taken(reloader)

@@ -20,7 +20,7 @@ from zenohkit import until
 
 from drivelink import cli, jointfile
 from drivelink.demo.simulate import alter, world_from_joint
-from drivelink.errors import RecordingError, UsageError
+from drivelink.errors import JointFileError, RecordingError, UsageError
 from drivelink.loop import acceptance, diagnosing, finding
 from drivelink.loop.feed import FindingFeed
 from drivelink.loop.finding import finding_file, proposal_file
@@ -203,14 +203,32 @@ def test_accepting_writes_the_file_keeps_the_old_one_and_can_be_undone(friction,
     assert [one.name for one in jointfile.load(path).motor[0].effect][-1] == "coulomb_friction"
     with pytest.raises(RecordingError, match="nothing to accept: accepted"):
         acceptance.proposal(path)
+    accepted = path.read_text() + "# by hand"
+    path.write_text(accepted)
     acceptance.undo(path)
     assert path.read_text() == ELBOW.read_text()
+    assert [one.read_text() for one in tmp_path.glob("elbow-*-undone.toml")] == [accepted]
     with pytest.raises(UsageError, match="nothing was accepted"):
         acceptance.undo(path)
     finding.write(offer.recording, offer.finding)
     path.write_text(ELBOW.read_text().replace("gear_ratio = 50.0", "gear_ratio = 51.0"))
+    edited = path.read_text()
     with pytest.raises(RecordingError, match="has changed since"):
         acceptance.proposal(path)
+    with pytest.raises(JointFileError, match="has changed meanwhile"):  # while the person was asked
+        acceptance.accept(offer)
+    assert path.read_text() == edited
+
+
+@pytest.mark.parametrize("damage", [{}, {"state": 1}, {"state": "proposed"}, {"state": "", "sentence": []}])
+def test_a_damaged_finding_is_none(damage, tmp_path):
+    (tmp_path / "elbow.toml").write_text(ELBOW.read_text())
+    (tmp_path / "kept").mkdir()
+    (made := tmp_path / "kept" / NAME).touch()
+    finding_file(made).write_text(json.dumps({"schema": finding.SCHEMA, **damage}))
+    with pytest.raises(RecordingError, match="no finding about demo-elbow yet"):
+        acceptance.proposal(tmp_path / "elbow.toml")
+    assert next_due(tmp_path / "kept", "demo-elbow") == made
 
 
 def status(residual: float, *, observable: bool = True, alarm: bool = False) -> dict[str, object]:
@@ -227,7 +245,12 @@ def status(residual: float, *, observable: bool = True, alarm: bool = False) -> 
 @pytest.mark.parametrize(
     ("residuals", "observable", "fallen", "words"),
     [
-        ([0.11, 0.12, 0.13, 0.1, 0.14], True, True, "has fallen to its baseline: 1.4 ×"),
+        (
+            [0.11, 0.12, 0.13, 0.1, 0.14],
+            True,
+            True,
+            "has fallen, within its limit for 5 s of motion: now 1.4 × its baseline",
+        ),
         ([0.11, 0.12, 0.9, 0.1, 0.14, 0.12], True, False, "has not fallen within a minute"),
         ([0.11, 0.12, 0.13, 0.1, 0.14], False, False, "has not moved enough"),
     ],

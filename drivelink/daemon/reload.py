@@ -141,18 +141,19 @@ class Reloader:
         self._ready = (joint, built, self._pipeline.warm(built[0], sequence, steps))
 
     def _refuse_changes(self, joint: JointFile) -> None:
+        for key in ("name", "arrangement"):
+            if getattr(joint, key) != (was := getattr(self._joint, key)):
+                raise DrivelinkError(f"{self.path.name}: {key}: expected {was}, as it was at the start")
         changed = [key for key, value in _fixed(joint).items() if self._fixed.get(key) != value]
         if changed:
             self._events.report(
                 f"{self.path.name}: {', '.join(changed)} changed, which requires a restart of the daemon",
                 logging.WARNING,
             )
-        if joint.arrangement != self._joint.arrangement:
-            raise DrivelinkError(f"arrangement: expected {self._joint.arrangement}, as it was at the start")
 
 
 def _fixed(joint: JointFile) -> dict[str, object]:
     """What a running daemon cannot change, by key."""
-    keys = ("name", "arrangement", "bus", "zenoh", "recording")
+    keys = ("bus", "zenoh", "recording")
     drives = {f"motor[{n}].drive": motor.drive for n, motor in enumerate(joint.motor, 1)}
     return {key: getattr(joint, key) for key in keys} | drives | {"link.encoder": joint.link.encoder}

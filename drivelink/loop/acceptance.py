@@ -83,11 +83,10 @@ def accept(offer: Proposal) -> Path:
         Where the old one is kept.
 
     Raises:
-        JointFileError: it cannot be written; the old one is in place.
+        JointFileError: it cannot be written, or has changed meanwhile; the old one is in place.
     """
     path, now = _place(offer.source), datetime.now(UTC)
-    old = path.with_name(f"{path.stem}-{now:{_STAMP}}{path.suffix}")
-    _copy(path, old)
+    old = _keep(offer.source, f"{now:{_STAMP}}")
     accepted = {
         "time": now.isoformat(timespec="seconds"),
         "before": old.name,
@@ -99,7 +98,7 @@ def accept(offer: Proposal) -> Path:
 
 
 def undo(path: Path) -> Path:
-    """Restore the joint file that was in use before the last acceptance.
+    """Restore the joint file that was in use before the last acceptance; the accepted one is kept, too.
 
     Returns:
         Where it was kept.
@@ -113,8 +112,9 @@ def undo(path: Path) -> Path:
     if not isinstance(accepted, dict) or not isinstance(accepted.get("before"), str):
         raise UsageError(f"{path}: --undo: nothing was accepted into this joint file")
     old = load_text(path.with_name(Path(accepted["before"]).name))
-    _copy(_place(old), _place(source))
-    recording = folder_of(source) / Path(str(accepted.get("recording"))).name
+    _keep(source, f"{datetime.now(UTC):{_STAMP}}-undone")
+    _copy(_place(old), _place(source), force=True)
+    recording = folder_of(old) / Path(str(accepted.get("recording"))).name
     found = finding.read(recording)
     if found is not None:
         finding.write(recording, {**found, "state": finding.UNDONE})
@@ -136,9 +136,19 @@ def _place(source: JointText) -> Path:
     return source.path
 
 
-def _copy(path: Path, target: Path) -> None:
+def _keep(source: JointText, mark: str) -> Path:
+    """Copy a joint file to a name with that mark, if it is still the one that was read."""
+    path = _place(source)
+    if load_text(path).text != source.text:
+        raise JointFileError(f"{path}: has changed meanwhile: nothing is written")
+    old = path.with_name(f"{path.stem}-{mark}{path.suffix}")
+    _copy(path, old, force=False)
+    return old
+
+
+def _copy(path: Path, target: Path, *, force: bool) -> None:
     try:
-        write_whole(target, read_regular(path, MAX_BYTES), force=True)
+        write_whole(target, read_regular(path, MAX_BYTES), force=force)
     except OSError as error:
         raise JointFileError(f"{error.filename}: cannot be copied: {error.strerror}") from error
 
@@ -195,9 +205,7 @@ class Trial:
         """Return what has come of it so far."""
         level = f"{max(self.ratios):.2g} × its baseline" if self.ratios else "not measured yet"
         if self.fallen:
-            return (
-                f"the residual has fallen to its baseline: {level}, within its limit for {_QUIET_SECONDS} s"
-            )
+            return f"the residual has fallen, within its limit for {_QUIET_SECONDS} s of motion: now {level}"
         if self.fallen is None:
             return (
                 f"the residual is {level}" if self.in_use else "waiting for the daemon to take the new model"

@@ -150,7 +150,8 @@ def read(recording: Path) -> dict[str, Any] | None:
         found = decode_document(read_regular(finding_file(recording), MAX_BYTES))
     except (OSError, DrivelinkError):
         return None
-    return found if found.get("schema") == SCHEMA else None
+    said = (found.get("state"), found.get("sentence"))
+    return found if found.get("schema") == SCHEMA and all(isinstance(one, str) for one in said) else None
 
 
 def newest(folder: Path, joint: str) -> tuple[Path, dict[str, Any]] | None:

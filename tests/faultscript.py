@@ -104,7 +104,7 @@ SCRIPT: tuple[Fault, ...] = (
     gap("a drive is stopped by another master", at(0.1, "inject", 0x000, b"\x02\x02"), says=(MISSING, STARTED),
         seconds=1.5),
     gap("SDO timeouts while it is configured again", at(0.1, "reboot", 2), at(0.1, "ignore_sdo", 2, 100), flags=BACK,
-        says=(REBOOTED, NODE_2_CANNOT + r".*does not answer: SDO 0x1000:00.*", STARTED), seconds=6.0),
+        says=(REBOOTED, NODE_2_CANNOT + r".*does not answer: SDO 0x1000:00.*", STARTED), seconds=1.5),
     gap("SDO aborts while it is configured again", at(0.1, "reboot", 2),
         at(0.1, "refuse_sdo", 2, 0x08000022, 10_000), at(3.5, "refuse_sdo", 2, 0x08000022, 0), flags=BACK,
         says=(REBOOTED, NODE_2_CANNOT + r".*0x08000022 \(.+\)", STARTED), seconds=4.0),

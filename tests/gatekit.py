@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -41,6 +42,7 @@ class Drawn:
     gears: tuple[float, ...]
 
 
+@cache
 def draw(kind: str, seed: int, *, effects: bool = True, seconds: float = 8.0, held: bool = False) -> Drawn:
     """The joint of that kind and seed, recorded in a rich motion; with its link held, if asked for."""
     rng = np.random.default_rng((KINDS.index(kind), seed))

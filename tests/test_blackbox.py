@@ -156,9 +156,9 @@ def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path):
         with zenohkit.process("run", str(path), "--no-realtime", "--json") as daemon:
             assert "ready" in daemon.stdout.readline()
             zenohkit.until((tmp_path / "kept").is_dir)
-            time.sleep(3.0)  # until the box has a state of the estimator
+            time.sleep(2.0)  # until the box has a state of the estimator
             zenohkit.until(lambda: cli.main(["keep", str(path)]) == 0)
-            time.sleep(1.0)  # something to keep
+            time.sleep(0.5)  # something to keep
             assert not kept(tmp_path / "kept", "elbow")  # 14 s more are to come, but the daemon ends
             daemon.send_signal(signal.SIGTERM)
             _, err = daemon.communicate(timeout=60)

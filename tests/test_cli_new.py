@@ -62,13 +62,12 @@ def test_a_case_is_a_copy_of_the_shipped_joint(tmp_path, case):
 
 
 NEW = [
-    (m, a)
-    for m in ("polynomial", "linear", "exponential", "vsa-ii")
-    for a in ("single", "antagonistic", "serial")
+    *((model, "single") for model in ("polynomial", "linear", "exponential", "vsa-ii", "none")),
+    *(("polynomial", arrangement) for arrangement in ("antagonistic", "serial")),
 ]
 
 
-@pytest.mark.parametrize(("model", "arrangement"), [*NEW, ("none", "single")])
+@pytest.mark.parametrize(("model", "arrangement"), NEW)
 def test_sim_accepts_every_new_file_and_says_what_it_assumes(tmp_path, model, arrangement, capsys):
     encoder = "none" if model == "none" else "9"
     made(tmp_path, "--model", model, "--arrangement", arrangement, "--encoder", encoder)

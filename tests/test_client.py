@@ -278,14 +278,14 @@ def test_asyncio_waits_iterates_and_times_out(publisher, endpoint):
 @pytest.fixture
 def hasty(monkeypatch):
     for module in ("clientbase", "client"):
-        monkeypatch.setattr(f"drivelink.pubsub.{module}.PATIENCE_S", 0.3)
+        monkeypatch.setattr(f"drivelink.pubsub.{module}.PATIENCE_S", 0.2)
 
 
 @pytest.mark.parametrize("how", ["wait", "latest", "async"])
 def test_a_name_without_daemon_is_said_once_with_the_nearest_one(publisher, endpoint, hasty, caplog, how):
     async def waits():
         async with drivelink.subscribe_async("elbwo", endpoint=endpoint) as joint:
-            await joint.wait(timeout_s=0.8)
+            await joint.wait(timeout_s=0.5)
 
     if how == "async":
         asyncio.run(waits())
@@ -293,14 +293,14 @@ def test_a_name_without_daemon_is_said_once_with_the_nearest_one(publisher, endp
         with drivelink.subscribe("elbwo", endpoint=endpoint) as joint:
             end = time.monotonic() + LIMIT_S
             while not caplog.messages and time.monotonic() < end:
-                joint.wait(timeout_s=0.8) if how == "wait" else (joint.latest(), time.sleep(0.01))
-            joint.wait(timeout_s=0.5)
+                joint.wait(timeout_s=0.4) if how == "wait" else (joint.latest(), time.sleep(0.01))
+            joint.wait(timeout_s=0.1)
     assert caplog.messages == ['no daemon of "elbwo"; did you mean "elbow"? there is elbow']
 
 
 def test_a_daemon_that_is_there_is_listed_and_not_missed(publisher, endpoint, hasty, caplog, capsys):
     with drivelink.subscribe("elbow", endpoint=endpoint) as joint:
-        joint.wait(timeout_s=0.8)
+        joint.wait(timeout_s=0.5)
     assert not caplog.messages
     assert drivelink.joints(endpoint=endpoint) == ["elbow"]
     assert cli.main(["list", "--endpoint", endpoint]) == 0 and capsys.readouterr().out == "elbow\n"

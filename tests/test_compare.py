@@ -30,7 +30,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, (effects, parameters) in kinds.items():
         world = world_from_joint(jointfile.load(ELBOW))
         alter(world, effects, parameters)
-        columns = record(world, 4.0)
+        columns = record(world, 3.0)
         rows = np.column_stack([columns[column] for column in COLUMNS])
         np.savetxt(folder / f"{name}.csv", rows, "%.17g", ",", header=",".join(COLUMNS), comments="")
     return folder

@@ -16,7 +16,7 @@ from sim.canopen.drive import Cia402Drive
 from sim.sensors import DriveSignals
 
 SYNC = 0x080
-LEARNING = 12_000  # cycles: the test begins after three seconds of blocks with motion
+LEARNING = 8000  # cycles: the test begins after three seconds of blocks with motion
 
 
 def joint(**changes: object) -> JointFile:
@@ -79,11 +79,15 @@ def test_a_lie_is_found_named_and_nothing_valid_said_until_it_is_over(calibrated
     assert (suspected["signal"], suspected["motor"], suspected["reason"]) == (signal, 1, "contradicted")
     assert suspected["text"] in " ".join(calibrated.status["conditions"])
     lie(calibrated, lambda s: s)
-    after = calibrated.run(3000)
-    assert not after[-1].status & Status.CONTRADICTED
-    assert "contradicts" not in checks(calibrated).values()
-    if name in UNUSED:  # else the estimator has its own way back
-        assert any(e.status & Status.VALID for e in after[-1000:])
+    for _ in range(6):  # 3000 cycles are enough
+        after = calibrated.run(500)[-1]
+        over = not after.status & Status.CONTRADICTED and "contradicts" not in checks(calibrated).values()
+        if over and (
+            name not in UNUSED or after.status & Status.VALID
+        ):  # else the estimator has its own way back
+            break
+    else:
+        raise AssertionError(f"not over: {checks(calibrated)}, {after}")
 
 
 def test_what_is_not_asked_for_is_not_mapped_and_what_does_not_come_costs_no_sample():

@@ -130,14 +130,16 @@ def rewrite(path: Path, old: str, new: str) -> None:
 IN_USE = "elbow.toml: the model in it is now in use"
 
 
-def test_accepting_a_model_and_undoing_it_lose_no_cycle(reloadable, tmp_path):
+def test_accepting_a_model_and_undoing_it_lose_no_cycle(reloadable, tmp_path, monkeypatch):
+    monkeypatch.setattr(reload, "load_apart", load)  # by a process: test_jointfile.py
+    monkeypatch.setattr(reload, "_EVERY_S", 0.05)
     made, path = reloadable, tmp_path / "elbow.toml"
     made.run(3000)  # until the model in use has shown itself valid
     syncs, source, estimates = made.network.syncs, load_text(path), list[Estimate]()
     old = made.loop_joint.pipeline.estimator
 
     def exchanged() -> bool:
-        estimates.extend(made.run(1))
+        estimates.extend(made.run(10))
         return made.loop_joint.pipeline.estimator is not old
 
     rewrite(path, "k_nm_rad = 0.5", "k_nm_rad = wrong")

@@ -36,6 +36,7 @@ VALID, CONTACT = int(ExternalStatus.VALID), int(ExternalStatus.CONTACT)
 GRAVITY_NM = 6.0
 PUSHES = ((8.0, 1.5), (9.0, -1.5), (10.0, 0.8), (11.0, -3.0))  # begin, torque; each lasts PUSH_S
 PUSH_S = 0.4
+LOST = 12_000  # samples until positions count from elsewhere
 LEARNED = 6000  # samples of free motion after which the spring is known
 W = EstimatorSettings().external_bandwidth_rad_s
 CERTAIN = {"inertia_std_kg_m2": 0.0, "viscous_damping_std_nm_s_rad": 0.0, "gravity_std_nm": 0.0}
@@ -200,7 +201,7 @@ def test_a_bias_takes_a_payload_in_and_lets_a_lasting_push_fade():
 def test_fit_finds_the_link_with_its_payload_in_a_free_motion():
     """1 kg at 0.3 m, declared by nobody: fitted to one motion, it is no contact in another, and a push is right."""
     payload = (1.0 * 0.3**2, 1.0 * 0.3 * 9.81)
-    rows = record(world(seed=7, payload=payload), 20.0)
+    rows = record(world(seed=7, payload=payload), 14.0)
     declared = LinkDynamics(inertia_kg_m2=0.4, viscous_damping_nm_s_rad=0.1, gravity_nm=GRAVITY_NM)
     free = Record(
         period_s=T,
@@ -257,16 +258,16 @@ def test_it_returns_when_positions_count_from_elsewhere_and_gravity_is_found_aga
     joint = jointfile.load(Path(__file__).parents[1] / "examples" / "vsa-ii.toml")
     estimator = make_estimator(joint.model(), joint.estimator, 1e-3)
     late = []
-    for sample in onlinekit.motion("vsa-ii", 40.0, seed=1).samples:
-        if sample.sequence == 20_000:
+    for sample in onlinekit.motion("vsa-ii", 30.0, seed=1).samples:
+        if sample.sequence == LOST:
             estimator.lose_zeros()
-        if sample.sequence >= 20_000 and signal == "motor":
+        if sample.sequence >= LOST and signal == "motor":
             first, *others = sample.motor_position_rad
             sample = sample._replace(motor_position_rad=(first + 0.3, *others))
-        elif sample.sequence >= 20_000:
+        elif sample.sequence >= LOST:
             sample = sample._replace(link_position_rad=sample.link_position_rad + 0.7)
         estimator.step(sample)
-        if sample.sequence >= 20_000:
+        if sample.sequence >= LOST:
             late.append(estimator.external)
     assert all(one.status & VALID for one in late[-5000:])
     valid = [one for one in late if one.status & VALID]

@@ -9,7 +9,7 @@ import faultmatrix as matrix
 import numpy as np
 import pytest
 
-HEALTH_S, FAULT_S = 8.0, 8.0
+HEALTH_S, FAULT_S = 6.0, 6.0
 KINDS = (
     "gain 0.9",
     "gain 1.25",

@@ -152,7 +152,7 @@ def test_a_one_way_motion_has_no_free_curve_over_time(speed):
 
 
 def test_a_free_curve_has_the_same_terms_in_a_longer_recording():
-    record = kit.World([{}], seed=31, seconds=16.0).run()[0]
+    record = kit.World([{}], seed=31, seconds=10.0).run()[0]
     short, long = (Problem([one], kit.model(), 15.0) for one in (joints.part(record, slice(6000)), record))
     for place in ("motor", "transmission", "link"):
         for names, basis in _bases(short.frames[0], short.null(), place, 0):

@@ -187,7 +187,7 @@ def test_no_delay_is_made_of_noise_and_one_that_is_there_has_an_honest_interval(
 
 def test_what_is_left_shows_friction_as_a_step_and_hysteresis_as_a_loop(tmp_path):
     effects = [{"coulomb_nm": 0.5}, {"hysteresis_nm": 1.0, "hysteresis_rad": 0.01}]
-    (stuck,), (looping,) = (fit(record, kit.model()) for record in kit.World(effects, seconds=8.0).run())
+    (stuck,), (looping,) = (fit(record, kit.model()) for record in kit.World(effects, seconds=6.0).run())
     step = [np.median(stuck.unexplained_nm[side * stuck.velocity_rad_s > 0.3]) for side in (1, -1)]
     assert step == pytest.approx([-0.5, 0.5], abs=0.05)
     directions = (looping.deflection_rate_rad_s > 0.0, looping.deflection_rate_rad_s < 0.0)

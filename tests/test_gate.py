@@ -103,7 +103,7 @@ def test_a_rich_motion_decides_every_sign_and_the_unit_of_the_link(kind):
 
 
 def test_the_sign_of_a_link_that_is_held_is_reported_as_undecided():
-    drawn = gatekit.draw("soft", 4, held=True)
+    drawn = gatekit.draw("soft", 4, held=True, seconds=6.0)
     reversed_link = gatekit.faulty(drawn.record, {"link_position": -1.0})
     judgement, turned = (judge(one, drawn.model) for one in (drawn.record, reversed_link))
     assert judgement.findings == () and "this motion does not reveal" in judgement.remark
@@ -139,7 +139,7 @@ def test_a_torque_that_is_only_noise_and_a_short_recording_decide_nothing():
     ],
 )
 def test_two_faults_at_once_and_a_reversed_motor_of_a_pair_are_named(kind, seed, factors):
-    drawn = gatekit.draw(kind, seed)
+    drawn = gatekit.draw(kind, seed, seconds=6.0)
     findings = examine(gatekit.faulty(drawn.record, factors), drawn.model)
     assert named(findings, factors)
     assert kind == "soft" or [finding.kind for finding in findings] == ["sign"]

@@ -66,14 +66,14 @@ def recorded(folder: Path, effects: tuple[str, ...] = (), name: str = NAME, **pa
 
 @pytest.fixture(scope="module")
 def friction(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording with friction, diagnosed by a process that does not wait for the others at idle priority."""
+    """A recording with friction, and its finding, made as the diagnosing process does but not at idle priority."""
     made = recorded(tmp_path_factory.mktemp("friction"), ("coulomb_friction=0.6",))
-    program = (
-        "import os, sys; os.nice = os.sched_setscheduler = lambda *_: 0; "
-        "from drivelink.loop import diagnosing; sys.exit(diagnosing.main())"
-    )
-    command = [sys.executable, "-c", program, str(made)]
-    assert subprocess.run(command, check=True, capture_output=True).returncode == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["diagnosing", str(made)])
+        for owner, name in ((os, "nice"), (os, "sched_setscheduler"), (signal, "signal")):
+            patch.setattr(owner, name, lambda *_: None)
+        patch.setattr(diagnosing.logging, "basicConfig", lambda **_: None)
+        assert diagnosing.main() == 0
     return made
 
 
@@ -99,6 +99,13 @@ def test_the_finding_says_what_since_when_and_the_error_before_and_after(frictio
     assert [one.name for one in proposed.motor[0].effect] == ["deflection_offset", "coulomb_friction"]
 
 
+@pytest.fixture
+def pageless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No page is drawn: `friction` has one."""
+    monkeypatch.setattr(diagnosing.report, "html_page", lambda *_: "")
+
+
+@pytest.mark.usefixtures("pageless")
 def test_a_softer_spring_is_no_effect_and_is_proposed_all_the_same(tmp_path):
     softer = {"motor1_coefficient1_nm_rad": 108.0, "motor1_coefficient2_nm_rad": 360.0}
     found = diagnosing.make(recorded(tmp_path, **softer))
@@ -108,6 +115,7 @@ def test_a_softer_spring_is_no_effect_and_is_proposed_all_the_same(tmp_path):
     assert abs(fitted[0] / 108.0 - 1.0) < 0.02
 
 
+@pytest.mark.usefixtures("pageless")
 def test_where_nothing_has_changed_nothing_is_proposed(tmp_path):
     made = recorded(tmp_path)
     found = diagnosing.make(made)
@@ -119,13 +127,17 @@ def test_where_nothing_has_changed_nothing_is_proposed(tmp_path):
         acceptance.proposal(tmp_path / "elbow.toml")
 
 
-def test_what_would_do_harm_is_not_proposed(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("pageless")
+def test_what_would_do_harm_is_not_proposed(friction, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "harm", lambda *_: "it is valid less often")
-    found = diagnosing.make(made := recorded(tmp_path, ("coulomb_friction=0.6",)))
+    made = tmp_path / friction.name
+    made.write_bytes(friction.read_bytes())
+    found = diagnosing.make(made)
     assert found["state"] == finding.NOTHING and not proposal_file(made).exists()
     assert found["sentence"].endswith("Nothing is proposed: it is valid less often.")
 
 
+@pytest.mark.usefixtures("pageless")
 def test_an_effect_of_the_link_is_proposed_by_the_links_balance_and_the_motor_stays(tmp_path):
     found = diagnosing.make(made := recorded(tmp_path, ("link_coulomb_friction=0.5",)))
     assert found["state"] == finding.PROPOSED and "error of the link torque falls" in found["sentence"]

@@ -23,7 +23,7 @@ def runs():
         "healthy": {}, "again": {}, "coulomb_nm": {"coulomb_nm": 0.4}, "gravity_nm": {"gravity_nm": 0.8},
         "hysteresis_nm": {"hysteresis_nm": 0.6, "hysteresis_rad": 0.01},
     }  # fmt: skip
-    return dict(zip(effects, kit.World(list(effects.values())).run(), strict=True))
+    return dict(zip(effects, kit.World(list(effects.values()), seconds=8.0).run(), strict=True))
 
 
 @pytest.fixture(scope="module")

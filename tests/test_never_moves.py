@@ -67,7 +67,7 @@ def lives(made):
     assert made.status["state"] == "running"
 
 
-@pytest.mark.parametrize("profile", ["elmo", "nanotec"])
+@pytest.mark.parametrize("profile", ["elmo", pytest.param("nanotec", marks=pytest.mark.slow)])
 def test_through_boot_run_reboot_and_configuration_no_frame_could_move_a_drive(profile):
     joint = parse(vsa_text() + f'quirks = "{profile}"\n')
     listener = Listener(joint)

@@ -74,7 +74,7 @@ def test_friction_that_nobody_declared_is_no_change_but_widens_the_interval():
 
 
 def test_a_fitted_spring_is_not_left_for_a_wrong_one():
-    record = kit.recorded(kit.motion("constant", 30.0).samples)
+    record = kit.recorded(kit.motion("constant", 20.0).samples)
     found = fit(record, kit.declared("constant", parameters={}))
     for seed in (1, 2):
         motion = kit.motion("constant", 8.0, seed=seed)

@@ -8,7 +8,7 @@ import pytest
 
 from sim.cases import case
 
-SECONDS = 12.0
+SECONDS = 10.0
 SETTLED = 5000
 SLOW = pytest.mark.slow
 FINE = (17, *(pytest.param(bits, marks=SLOW) for bits in (19, 22)), 26)
@@ -41,7 +41,7 @@ def test_fine_encoders_cost_no_valid(name, pace, bits, noise):
     excitation = case(name).excitation if pace == "slow" else None  # slow: one sine of 0.05 Hz a motor
     estimates, wrong = estimates_of(name, bits, noise, excitation)
     assert not np.any(wrong)
-    # At 17 bits the constant case has one false alarm in these 7 s; the 0.27 s after it are not valid.
+    # At 17 bits the constant case has one false alarm in these 5 s; the 0.27 s after it are not valid.
     assert np.mean(estimates.valid[SETTLED:]) > (0.95 if (name, bits) == ("constant", 17) else 0.99)
 
 

@@ -106,7 +106,7 @@ def test_a_node_that_says_other_units_time_after_time_is_not_used():
         assert "does another device answer for it?" in line
         assert not any(e.status & Status.VALID for e in estimates[-1000:])
         entry.refresh, entry.value = None, right
-        assert any(e.status & Status.VALID for e in made.run(8000)[-1000:])
+        assert any(e.status & Status.VALID for _ in range(8) for e in made.run(1000))
 
 
 def test_a_unit_that_changes_in_the_run_has_the_node_configured_anew():

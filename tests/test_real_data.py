@@ -32,7 +32,8 @@ def test_emps_friction_is_found_and_the_published_errors_are_beaten():
     assert found.validation.after_relative < 0.0598  # published: 5.98 %
 
 
-@pytest.mark.parametrize(("axis", "limit"), [(3, 0.24), pytest.param(2, 0.36, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("axis", "limit"), [(3, 0.24), (2, 0.36)])
 def test_kuka_axes_have_friction_and_get_better_on_the_other_recording(axis, limit):
     recordings = [f"kuka_kr300/axis{axis}_{name}.csv" for name in "AB"]
     found = _diagnose(f"kuka_axis{axis}", recordings[0], recordings[1], 15.0)

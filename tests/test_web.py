@@ -75,6 +75,7 @@ WIDE = "[...document.querySelectorAll('.numbers dl')].filter(d => d.scrollWidth 
 SAVE = "HTMLAnchorElement.prototype.click = function() { saved = this.href; }; $('save').click()"
 
 
+@pytest.mark.slow  # what the page does with what it gets: test_web_page.py
 @pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
 def test_the_page_draws_live_plots_in_a_browser(web, polling, tmp_path):
     with chromium.Chromium(tmp_path / "profile") as browser:

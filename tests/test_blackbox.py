@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import signal
 import time
+from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zenohkit
@@ -14,6 +16,7 @@ from mcap.reader import make_reader
 from test_recording_recorder import joint_file
 
 from drivelink import cli, jointfile
+from drivelink.loop import blackbox
 from drivelink.loop.blackbox import AFTER_S, BlackBox
 from drivelink.loop.finding import drop_oldest, event_of, kept
 from drivelink.pubsub.feed import DECODERS
@@ -174,3 +177,13 @@ def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path):
     recorded = [m.data for m in read_messages(made[0], frozenset({"estimate"}))]
     assert len(again) > 100 and again == recorded[-len(again) :]  # bit for bit
     assert ticks[0].sequence > cycles[0].sequence  # from a state in the middle of the run
+
+
+def test_with_the_same_wall_time_at_each_start_no_recording_takes_the_place_of_another(tmp_path, monkeypatch):
+    wall = SimpleNamespace(now=lambda _: datetime(1970, 1, 1, tzinfo=UTC))
+    monkeypatch.setattr(blackbox, "datetime", wall)
+    for count in (1, 2):
+        scene = Scene(tmp_path)
+        scene.run(100)
+        scene.run(200, Status.MODEL_ALARM)
+        assert len(scene.finish()) == count

@@ -58,6 +58,12 @@ def test_the_status_has_the_external_torque_where_the_link_is_declared():
         assert (begin["valid"], begin["contact"]) == (False, False) and math.isnan(begin["torque_nm"])
 
 
+def test_the_uptime_is_not_that_of_a_clock_that_was_set(monkeypatch):
+    with rig() as made:
+        monkeypatch.setattr(time, "time", lambda: 4e9)
+        assert made.status["time"] == 4e9 and made.status["uptime_s"] < 3600.0
+
+
 def test_a_second_daemon_of_the_same_name_is_refused_and_leaves_the_drives_alone():
     joint = vsa(endpoint=free_endpoint())
     # The first one has its name from the start on; it need not run, and so asks no drive anything.

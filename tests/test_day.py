@@ -39,6 +39,15 @@ class Written:
             self.day.row()
 
 
+def test_rows_of_a_clock_that_was_wrong_are_not_of_the_last_day(tmp_path):
+    written = Written(tmp_path)
+    for begin_s in (0.0, BEGIN_S + 3e9, BEGIN_S + 100.0, BEGIN_S):  # each time it is set: at last, right
+        written.now_s = begin_s
+        written.run(150)
+    table = day.rows(tmp_path, "elbow")
+    assert table[:, 0].tolist() == sorted(BEGIN_S + s for s in (*range(1, 151), *range(101, 151)))
+
+
 def kept_one(folder: Path) -> Path:
     recording = folder / recording_name("elbow", "model alarm", datetime.fromtimestamp(BEGIN_S + 60, UTC))
     recording.write_bytes(b"mcap")

@@ -104,7 +104,7 @@ def test_a_model_alarm_that_flickers_is_counted_whatever_its_residual(events, ca
         alarmed(watch, Status.VALID if k % 2 else Status.MODEL_ALARM, [1e-4 * k])
     assert len(caplog.records) == 2
     assert [event["count"] for event in events.recent()] == [500, 500]
-    assert "3.3 times its baseline" in events.recent()[1]["text"]
+    assert "3.3 times its baseline" in events.recent()[0]["text"]
 
 
 def test_emergencies_with_other_bytes_of_the_maker_and_faults_of_one_kind_in_one_place_are_counted(
@@ -127,4 +127,4 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(events,
     begun, over = caplog.messages
     said = "elbow: model alarm: the residual is 3 times its baseline, likely at the transmission"
     assert begun.startswith(said) and "drivelink diagnose" in begun
-    assert over == "elbow: the model alarm is over: the residual is 0.67 times its baseline"
+    assert over == "elbow: the model alarm is over"

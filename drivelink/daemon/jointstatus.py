@@ -47,8 +47,8 @@ class JointStatus:
         self._supervisor = supervisor
         self._events = events
         self._bus_load = bus_load
-        self._started_s = time.time()
-        self._before = (time.monotonic(), 0, time.process_time())
+        self._started_s = time.monotonic()
+        self._before = (self._started_s, 0, time.process_time())
         self._asked = 0
         self._timing: dict[str, Any] = {"latency": {}, "response": {}, "jitter": {}}
         self.real_time: RealTime | None = None
@@ -75,7 +75,7 @@ class JointStatus:
             state: "starting" or "stopped"; default: determined from the loop.
         """
         loop, loop_joint, events = self._loop, self._loop_joint, self._events
-        now, unix_s = time.monotonic(), time.time()
+        now = time.monotonic()
         before_s, before_estimates, before_cpu_s = self._before
         cpu_s, elapsed_s = time.process_time(), max(now - before_s, 1e-9)
         self._before = (now, loop_joint.estimates, cpu_s)
@@ -83,8 +83,8 @@ class JointStatus:
             "schema": "drivelink.status/1",
             "joint": loop_joint.name,
             "state": state or self._state(),
-            "time": unix_s,
-            "uptime_s": round(unix_s - self._started_s, 3),
+            "time": time.time(),
+            "uptime_s": round(now - self._started_s, 3),
             "version": __version__,
             "pid": os.getpid(),
             "period_s": self._joint.bus.period_s,

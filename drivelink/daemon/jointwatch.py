@@ -112,8 +112,7 @@ class JointWatch:
             )
         else:
             self._alarmed.discard(loop_joint.name)
-            text = f"{loop_joint.name}: the model alarm is over{residual_text(monitor)}"
-            self._events.report(text, key=f"{loop_joint.name}: no model alarm")
+            self._events.report(f"{loop_joint.name}: the model alarm is over")
 
     def _check_contradiction(self, loop_joint: LoopJoint) -> None:
         """Report begin and end of a contradiction between readings."""

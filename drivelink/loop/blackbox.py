@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
 
 from drivelink.errors import JointFileError, RecordingError
@@ -218,12 +218,14 @@ class BlackBox(Sink):
     def _write(self, event: _Event, items: Sequence[tuple[str, tuple[Any, ...]]]) -> None:
         """Write one recording; what goes wrong is one line, and no half of a file stays."""
         sink: McapSink | None = None
-        path = self._folder / recording_name(self._text.joint.name, event.cause, event.wall)
+        name, wall = self._text.joint.name, event.wall
+        while (path := self._folder / recording_name(name, event.cause, wall)).exists():
+            wall += timedelta(seconds=1)  # of a clock that was set back, or begins with each start
         unfinished = path.with_suffix(UNFINISHED)
         try:
             sink = McapSink(unfinished, self._text.joint, self._text.text, force=True)
-            wall = event.wall.isoformat(timespec="milliseconds")
-            about = {"cause": event.cause, "causes": ", ".join(event.causes), "time": wall}
+            time_text = event.wall.isoformat(timespec="milliseconds")
+            about = {"cause": event.cause, "causes": ", ".join(event.causes), "time": time_text}
             sink.note("black box", {**about, "joint_file": self._text.name})
             if self._mapping is not None:
                 sink.mapping(*self._mapping)

@@ -101,7 +101,9 @@ def rows(folder: Path, joint: str) -> FloatArray:
                 row = [float(value) for value in line.split(",")]
                 found += [row] if len(row) == len(COLUMNS) else []
     table = np.reshape(np.array(found, dtype=np.float64), (-1, len(COLUMNS)))
-    return np.asarray(table[table[:, 0] > (table[-1, 0] if len(table) else 0.0) - DAY_S])
+    now_s = table[-1, 0] if len(table) else 0.0  # a later row is of a clock that was wrong
+    table = table[(table[:, 0] > now_s - DAY_S) & (table[:, 0] <= now_s)]
+    return np.asarray(table[np.argsort(table[:, 0], kind="stable")])
 
 
 def thinned(table: FloatArray, begin_s: float, end_s: float, most: int) -> list[list[float | None]]:

@@ -58,13 +58,15 @@ def check_target(path: Path, inputs: Iterable[Path] = (), *, force: bool = False
         inputs: input files; symbolic and hard links count as the same file.
 
     Raises:
-        UsageError: it is an input or a folder, or it exists.
+        UsageError: it is an input or a folder, it exists, or its folder is none.
     """
     for given in inputs:
         if _same(path, given):
             raise UsageError(f"{path}: is read here and must not be replaced: choose another name")
     if path.is_dir():
         raise UsageError(f"{path}: expected the name of a file, got a folder")
+    if path.parent.exists() and not path.parent.is_dir():
+        raise UsageError(f"{path.parent}: expected a folder, got a file")
     if not force and path.is_file():
         raise UsageError(f"{path}: exists already; --force replaces it")
 

@@ -74,6 +74,8 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(verb, arguments, tmp_path
         (["sim", "far.toml"], 4, "port"),
         (["sim", "driveless.toml"], 2, "driveless.toml: motor[1].drive: expected this table"),
         (["fit", "r.csv", "--joint", "linaer.toml"], 2, "linaer.toml: motor[1]: transmission.model: expected one of linear"),
+        (["fit", "there.toml", "--joint", "elbow.toml", "--out", "there.toml"], 2, "there.toml: expected a folder, got a file"),
+        (["compare", "elbow.toml", "elbow.toml", "--out", "there.toml"], 2, "there.toml: expected a folder, got a file"),
         (["record", "elbow.toml", "--out", "r.xyz"], 3, "expected a name that ends in .mcap"),
         (["record", "elbow.toml", "--out", "none/r.csv"], 3, "cannot be written"),
         (["record", "elbow.toml", "--out", "elbow.toml"], 2, "is read here and must not be replaced"),

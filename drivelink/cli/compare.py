@@ -7,6 +7,7 @@ from pathlib import Path
 
 from drivelink.cli import add_map, add_number, conclude, wrote
 from drivelink.errors import RecordingError
+from drivelink.files import check_target
 
 EPILOG = """\
 examples:
@@ -41,6 +42,8 @@ def run(args: argparse.Namespace) -> int:
     for path in (args.a, args.b):
         if not path.exists():
             raise RecordingError(f"{path}: no such file")
+    if args.out is not None:
+        check_target(args.out / "comparison.json", (args.a, args.b), force=True)
     from drivelink.comparison import compare  # takes a second; the arguments are checked
     from drivelink.output.document import page, write
 

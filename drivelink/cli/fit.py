@@ -52,6 +52,10 @@ def run(args: argparse.Namespace) -> int:
             raise RecordingError(f"{path}: no such file")
     if args.write is not None:  # the joint file itself may be brought up to date
         check_target(args.write, args.recording, force=args.force)
+    inputs = [*args.recording, *([args.joint] if args.joint else [])]
+    for target in (args.out and args.out / "fit.json", folder and folder / "fit.png"):
+        if target is not None:
+            check_target(target, inputs, force=True)
     joint_of(args.recording[0], args.joint)
     _fit(args, folder)
     return 0
@@ -69,8 +73,6 @@ def _fit(args: argparse.Namespace, folder: Path | None) -> None:
     if args.out is not None:
         written.append(args.out / "fit.json")
         args.out.mkdir(parents=True, exist_ok=True)
-        inputs = [*args.recording, *([args.joint] if args.joint else [])]
-        check_target(written[0], inputs, force=True)
         write_whole(written[0], json.dumps(document, indent=2) + "\n", force=True)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)

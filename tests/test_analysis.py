@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
 
@@ -102,12 +100,3 @@ def test_three_lines_fit_predict_plot_and_write(fleet, tmp_path):
     assert str(found).startswith("The model is sufficient")
     assert found.plot()._repr_png_().startswith(b"\x89PNG")
     assert [path.name for path in found.report(tmp_path)] == ["report.json", "report.html"]
-
-
-def test_import_is_lazy_and_help_lists_what_there_is():
-    code = (
-        "import sys, pydoc, drivelink; assert not {'numpy', 'scipy', 'matplotlib', 'zenoh'} & set(sys.modules);"
-        "text = pydoc.plain(pydoc.render_doc(drivelink)); assert 'fit(recordings' in text, text; assert 'subscribe' in dir(drivelink);"
-        "assert set(drivelink.__all__) <= set(dir(drivelink))"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -7,14 +7,7 @@ import pytest
 
 from drivelink.canopen.bus import interface_is_up, open_bus
 from drivelink.canopen.emcy import drive_state, emergency_text, parse_emergency
-from drivelink.canopen.layout import (
-    MappedObject,
-    NodeLayout,
-    Signal,
-    TpdoLayout,
-    bus_load,
-    frame_bits,
-)
+from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout, bus_load, frame_bits
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection
 

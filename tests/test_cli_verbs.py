@@ -31,6 +31,7 @@ NAMED = 'name = "{}"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
 )
 def test_every_verb_that_uses_a_bus_takes_it_by_option(verb, arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("drivelink.cli.record._ALIVE_S", 0.1)
     assert main(["new", "elbow.toml", "--interface", "virtual"]) == 0
     capsys.readouterr()
     given = [text.format(joint="elbow.toml") for text in arguments]
@@ -101,6 +102,7 @@ def test_what_a_verb_cannot_do_is_one_line(
     capsys,
 ):  # fmt: skip
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("drivelink.cli.record._ALIVE_S", 0.1)
     (tmp_path / "there.toml").write_text("# mine\n")
     joint = NAMED + '[motor.drive]\nnode_id = 1\n[link.encoder]\n[sim]\ncase = "constant"\n[bus]\n{}\n'
     texts = {
@@ -161,8 +163,10 @@ def test_new_sim_and_service_print_one_object(tmp_path, capsys):
     assert set(removed["removed"]) == set(installed["written"])
 
 
-def test_a_console_without_unicode_gets_the_words_spelt_out(fleet):
-    run, joint = fleet / "recordings" / "elbow-2026-01-05.csv", fleet / "joints" / "elbow.toml"
+def test_a_console_without_unicode_gets_the_words_spelt_out(fleet, tmp_path):
+    whole, joint = fleet / "recordings" / "elbow-2026-01-05.csv", fleet / "joints" / "elbow.toml"
+    run = tmp_path / "run.csv"
+    run.write_text("".join(whole.read_text().splitlines(keepends=True)[:4000]))
     command = [sys.executable, "-m", "drivelink", "fit", str(run), "--joint", str(joint)]
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)

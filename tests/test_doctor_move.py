@@ -110,22 +110,18 @@ def test_what_is_right_is_ticked_and_nothing_is_to_paste():
         ({"motor1_position": 100.0, "motor1_torque": 0.01}, 1.0, ["motor[1].drive.gear_ratio = 97.78"]),
         ({"motor1_position": 0.02, "motor1_torque": 50.0}, 50.0, ["motor[1].drive.gear_ratio = 0.9778"]),
         ({"link_position": 4.0}, 1.0, ["link.encoder.counts_per_rev = 256300"]),
+        ({"motor2_position": -1.0, "motor2_torque": -1.0}, 1.0, ["motor[2].drive.direction = -1"]),
     ],
 )  # fmt: skip
 def test_each_fault_ends_in_the_line_that_cures_it(wrong, gear, lines):
-    done = checked(wrong, gear=gear)
+    done = checked(wrong, "antagonistic" if "motor2_position" in wrong else "single", gear)
+    assert {mark.channel for mark in done.marks if mark.good is False} <= set(wrong)
     got = [line.partition(" = ") for line in done.paste]
     want = [line.partition(" = ") for line in lines]
     assert [g[0] for g in got] == [w[0] for w in want]
     for g, w in zip(got, want, strict=True):
         assert float(g[2]) == pytest.approx(float(w[2]), rel=2e-4)
     assert not done.as_dict()["good"]
-
-
-def test_a_reversed_motor_of_a_pair_is_named():
-    done = checked({"motor2_position": -1.0, "motor2_torque": -1.0}, "antagonistic")
-    assert done.paste == ["motor[2].drive.direction = -1"]
-    assert {mark.channel for mark in done.marks if mark.good is False} == {"motor2_position", "motor2_torque"}
 
 
 @pytest.mark.parametrize(

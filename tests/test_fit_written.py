@@ -52,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     worlds = kit.World([{}, {"late_s": LATE_S, "zero_rad": ZERO_RAD}]).run()
     for name, record in zip(("clean", "skewed"), worlds, strict=True):
         joints.write_csv(record, folder / f"{name}.csv")
-    pair = gatekit.draw("antagonistic", 1, seconds=8.0, effects=False)
+    pair = gatekit.draw("antagonistic", 1, seconds=6.0, effects=False)
     joints.write_csv(pair.record, folder / "pair.csv")
     texts = (
         MOTOR.format(inertia=m.inertia_kg_m2, damping=m.viscous_damping_nm_s_rad, model="polynomial")

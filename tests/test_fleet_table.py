@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -149,19 +147,6 @@ def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_cha
     text = page(document)
     assert "<h1>1 of 1 joint needs a look: 1 lost</h1>" in text
     assert text.count('class="found"') == 2 and "134 → 2.00 % of the torque" in text
-
-
-# The rest of the service
-
-
-def test_neither_daemon_nor_command_line_imports_what_the_fleet_needs():
-    code = (
-        "import sys, drivelink, drivelink.cli, drivelink.cli.run, drivelink.daemon.service, drivelink.cli.fleet;"
-        "found = {'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas', 'botocore', 'paramiko'} & set(sys.modules);"
-        "sys.exit(', '.join(found) or None)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 def test_the_examples_of_the_documentation_read_the_table(tmp_path, monkeypatch, capsys):

@@ -118,12 +118,12 @@ def test_a_passive_daemon_puts_no_frame_on_the_bus_whatever_happens(monkeypatch)
                 until(lambda: loop_joint.estimates > 100)
                 network.nodes[0].reset_node()
                 before = loop_joint.pipeline.assembler.counters[1].received
-                until(lambda: loop_joint.pipeline.assembler.counters[1].received > before + 100)
+                until(lambda: loop_joint.pipeline.assembler.counters[1].received > before + 40)
                 network.power_off(network.nodes[1])
                 time.sleep(0.7)
                 network.power_on(network.nodes[1])
                 before = loop_joint.pipeline.assembler.counters[2].received
-                until(lambda: loop_joint.pipeline.assembler.counters[2].received > before + 100)
+                until(lambda: loop_joint.pipeline.assembler.counters[2].received > before + 40)
                 assert follower.documents()[0]["bus"]["lost_sends"] == 0
             assert master.is_alive()
     mine = [cob_id for sender, cob_id in senders if sender is follower._port.bus]

@@ -59,7 +59,7 @@ def test_a_clean_file_comes_back_bit_for_bit(tmp_path, said):
     assert not said.messages
 
 
-@pytest.mark.parametrize("period_s", [0.00025, 0.001, 0.0013, 0.004, 1 / 300, 0.02, 0.5])
+@pytest.mark.parametrize("period_s", [0.00025, 0.0013, 1 / 300, 0.5])
 @pytest.mark.parametrize("start_s", [0.0, -3.0, 1_790_000_000.25])
 def test_any_rate_is_found_exactly(tmp_path, period_s, start_s):
     record = read(write(tmp_path / "r.csv", rows(400, period_s, start_s)))

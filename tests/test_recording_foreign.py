@@ -168,8 +168,7 @@ TOOLS: dict[str, tuple[str, Callable[[list[Line]], bytes]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("node", [1, 5])
-@pytest.mark.parametrize("tool", TOOLS)
+@pytest.mark.parametrize(("tool", "node"), [*((tool, 1) for tool in TOOLS), ("BLF", 5)])
 def test_what_a_tool_wrote_is_decoded_as_it_was(tool, node, tmp_path):
     suffix, write = TOOLS[tool]
     path = tmp_path / f"r{suffix}"

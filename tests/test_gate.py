@@ -63,11 +63,11 @@ def named(findings: list[Discrepancy], factors: dict[str, float]) -> bool:
 
 
 @pytest.mark.parametrize(
-    "seeds", [range(100, 101), pytest.param(range(101, 109), marks=pytest.mark.slow)], ids=["one", "more"]
+    "seeds", [range(100, 101), pytest.param(range(101, 105), marks=pytest.mark.slow)], ids=["one", "more"]
 )
 @pytest.mark.parametrize("kind", gatekit.KINDS)
 def test_a_healthy_joint_passes(kind, seeds):
-    """Nine random joints of each kind: undeclared effects, late channels, inertia up to a fifth off."""
+    """Five random joints of each kind: undeclared effects, late channels, inertia up to a fifth off."""
     for seed in seeds:
         drawn = gatekit.draw(kind, seed, seconds=6.0)
         assert examine(drawn.record, drawn.model) == [], (kind, seed)
@@ -235,6 +235,11 @@ node_id = 1
 def test_what_comes_from_drives_is_corrected_at_the_drive(changes, lines):
     needed = [Change(channel, factor) for channel, factor in changes.items()]
     assert [str(c) for c in corrections(parse(DRIVES), needed, live=True)] == lines
+    turned = parse(
+        DRIVES.replace("node_id = 2", "node_id = 2\ntorque_direction = -1")
+    )  # wrongly, it turns out
+    (back,) = corrections(turned, [Change("motor2_torque", -1.0)], live=True)
+    assert str(back) == "motor[2].drive.torque_direction = 1"
 
 
 def _measured(path: str, joint: str) -> tuple[Record, JointModel]:

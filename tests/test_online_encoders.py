@@ -11,8 +11,8 @@ from sim.cases import case
 SECONDS = 10.0
 SETTLED = 5000
 SLOW = pytest.mark.slow
-FINE = (17, *(pytest.param(bits, marks=SLOW) for bits in (19, 22)), 26)
-COARSE = (12, *(pytest.param(bits, marks=SLOW) for bits in (14, 16)))
+FINE = (17, *(pytest.param(bits, marks=SLOW) for bits in (21,)), 26)
+COARSE = (12, *(pytest.param(bits, marks=SLOW) for bits in (15,)))
 QUIET = pytest.mark.parametrize("noise", [pytest.param(False, marks=SLOW), True], ids=["quiet", "noisy"])
 
 

@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 import zenoh
 from daemonkit import served, vsa
-from zenohkit import LIMIT_S, ready, script, until
+from zenohkit import LIMIT_S, joint_text, ready, script, until
 
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.errors import ZenohError
-from drivelink.jointfile import ZenohSection
+from drivelink.jointfile import ZenohSection, parse
+from drivelink.pubsub.clientbase import joints
+from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import FILES, close_session, daemon_config, open_client, open_session
 
 
@@ -95,6 +97,20 @@ def test_of_two_daemons_that_start_at_once_with_one_name_one_stays(endpoint):
         stays = other if one.poll() is not None else one
         ready(stays)
         assert stays.poll() is None
+
+
+def test_all_daemons_are_met_before_anybody_is_asked(endpoint):
+    names = ["one", "three", "two"]
+    with ExitStack() as stack:
+        for name in names:
+            daemon = stack.enter_context(script(name, endpoint))
+            ready(daemon)
+        for _ in range(4):
+            assert joints(endpoint=endpoint) == names
+            session = open_session(ZenohSection(endpoint=endpoint), Path())
+            stack.callback(close_session, session)
+            with pytest.raises(ZenohError, match="another daemon already serves a joint named two"):
+                JointPublisher(session, parse(joint_text("two", endpoint)))
 
 
 def test_an_uncaught_exception_ends_the_process(endpoint):

@@ -146,6 +146,7 @@ class Rendezvous:
 
 _MEETING_S = 2.0  # timeout of a local handshake, reached only if another program answers
 _POLL_S = 0.01
+_SCOUTING_MS = 250  # for a session to hear of another one
 ENDPOINT = "tcp/127.0.0.1:7447"
 _LINKS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream", "serial", "vsock")
 _MOST_CONFIG_BYTES = 256 << 10
@@ -154,7 +155,7 @@ FILES = 8192  # open files: more than the connections that may wait
 _COMMON: dict[str, Any] = {
     "mode": "peer",
     "scouting/multicast/enabled": False,
-    "scouting/delay": 250,  # ms that opening waits for somebody to connect to
+    "scouting/delay": _SCOUTING_MS,
     "transport/unicast/open_timeout": 2000,  # ms; closing waits for it
     "transport/unicast/accept_timeout": 2000,  # ms that a connection may say nothing
     "transport/unicast/accept_pending": 4096,  # of these; further ones, subscribers too, have to wait
@@ -318,13 +319,20 @@ def _keep(session: zenoh.Session, rendezvous: Rendezvous | None = None) -> zenoh
 
 
 def connected(session: zenoh.Session) -> bool:
-    """Return whether the session has a connection, or gets one within two seconds."""
-    deadline = time.monotonic() + _MEETING_S
-    while time.monotonic() < deadline:
-        if session.info.peers_zid() or session.info.routers_zid():
-            return True
+    """Return whether the session gets connections within two seconds, once no further one comes.
+
+    Opening waits for none of them, and a peer does not answer for another.
+    """
+    met: set[zenoh.ZenohId] = set()
+    since_s = time.monotonic()
+    deadline_s = since_s + _MEETING_S
+    while (now_s := time.monotonic()) < deadline_s:
+        if (there := {*session.info.peers_zid(), *session.info.routers_zid()}) != met:
+            met, since_s = there, now_s
+        elif met and now_s - since_s > 1e-3 * _SCOUTING_MS:
+            break
         time.sleep(_POLL_S)
-    return False
+    return bool(met)
 
 
 @atexit.register

@@ -53,6 +53,7 @@ class Case(NamedTuple):
     order: int | None = 2
     off: tuple[float, float] | None = None  # declared parameters over the true ones; None: none are
     stiff: bool = False
+    pull: float = 0.0  # on the link, over the motion's torque: the deflection stays on one side
     more: Mapping[str, float | str] = {}
 
 
@@ -70,6 +71,9 @@ CASES = {
     "vsa-ii as a polynomial of 3": Case("vsa-ii", "polynomial", 3),
     "exponential from nothing": Case("exponential", "exponential", None),
     "exponential declared 20 % off": Case("exponential", "exponential", None, OFF),
+    "exponential as unknown": Case("exponential", "unknown", None),
+    "exponential as unknown, on one side": Case("exponential", "unknown", None, pull=1.5),
+    "vsa-ii as unknown, on one side": Case("vsa-ii", "unknown", None, pull=1.5),
 }
 # Of a spring's shape: the setting, the parameter, its lower bound, the range that is drawn.
 SHAPES = {
@@ -128,6 +132,7 @@ def drawn(case: Case, effect: str, seed: int, seconds: float, motion: str) -> Dr
         return rng.uniform(*(stiff if case.stiff else soft))
 
     stiffness, size = between((80, 220), (5500, 12000)), between((5, 10), (15, 40))
+    motion = "point-to-point" if case.pull else motion  # nothing else holds the joint
     inertia, damping = between((0.08, 0.2), (0.3, 1.2)), between((0.4, 1.2), (2, 10))
     where = 4e-3 if case.stiff else 0.06  # rad: there the cubic part is a few to thirty percent
     settings: dict[str, float | str] = {
@@ -146,6 +151,7 @@ def drawn(case: Case, effect: str, seed: int, seconds: float, motion: str) -> Dr
         "size": rng.uniform(0.5, 1.2) if motion == "point-to-point" else size,
         "top_hz": rng.uniform(0.5, 2.0) if motion == "harmonic" else 3.0,
         "push": size / 2 if motion == "pushes" else size,
+        "pull": case.pull * size,
         "seconds": seconds,
         "seed": seed,
     }

@@ -27,7 +27,7 @@ static double link_inertia = 0.45, link_damping = 0.5, gravity = 3;
 static double friction, coulomb = 0.3, stribeck = 0.5, stribeck_velocity = 0.05, bristle = 2e-3, bristle_damping = 0.3;
 static double gear_loss, hysteresis, hysteresis_torque = 0.3, hysteresis_width = 4e-3, backlash, rounding = 0.25;
 static double transmission_damping, cogging, cogging_periods = 32, link_delay, motor_counts = 8192, link_bits = 17;
-static double torque_noise, motion, size = 7, top_hz = 3, push = 5, seconds = 30, period = 1e-3, seed = 1;
+static double torque_noise, motion, size = 7, top_hz = 3, push = 5, pull, seconds = 30, period = 1e-3, seed = 1;
 
 static const struct setting {
     const char *name;
@@ -67,6 +67,7 @@ static const struct setting {
     {"size", &size, 0, "amplitude of the motor's torque, N·m; point-to-point: largest step, rad"},
     {"top_hz", &top_hz, 0, "fastest sine, or the harmonic one"},
     {"push", &push, 0, "amplitude of the torque on the link, N·m: hand-guided, pushes"},
+    {"pull", &pull, 0, "constant torque on the link, N·m: a weight, or an opposing spring"},
     {"seconds", &seconds, 0, "length"},
     {"period", &period, 0, "s"},
     {"seed", &seed, 0, "of phases, targets, pushes and noise"},
@@ -230,13 +231,13 @@ static double motor_torque(const double *x, double t) {
 }
 
 static double external_torque(double t) {
-    if (motion == HAND_GUIDED) return push * sum_sines(&guided, t);
-    if (motion != PUSHES) return 0;
+    if (motion == HAND_GUIDED) return pull + push * sum_sines(&guided, t);
+    if (motion != PUSHES) return pull;
     if (t >= push_start + push_time) {
         push_start = t + uniform(0.5, 3), push_time = uniform(0.1, 0.4);
         push_torque = push * uniform(-1, 1);
     }
-    return t < push_start ? 0 : push_torque * sin(PI * (t - push_start) / push_time);
+    return pull + (t < push_start ? 0 : push_torque * sin(PI * (t - push_start) / push_time));
 }
 
 static double read_encoder(double angle, double per_turn) {

@@ -117,3 +117,35 @@ def test_powers_beyond_the_declared_order_are_found_and_named():
         assert np.mean(settled) > 0.99
         assert np.mean(off < 3.0 * std) > 0.99
         assert ("higher_order_stiffness" in estimator.undeclared()[0]) == longer
+
+
+@pytest.mark.parametrize("pull", [0.0, 9.0], ids=["both sides", "one side"])
+def test_an_unknown_spring_may_have_a_corner_and_be_bent_to_one_side(pull):
+    """A weight, or the other spring of an antagonistic pair, keeps the deflection on one side: there a zero that has
+    moved cannot be told from another curve, and moving it made torques wrong by a tenth and more of theirs."""
+    torque, stiffness, _ = SPRINGS["exponential"]
+
+    def pulled(_t, _state, rate, _tau):
+        rate[:, 3] += pull / 0.45
+
+    targets = np.random.default_rng(0).uniform(-0.6, 0.6, N // 1000 + 2)
+
+    def follow(k, state):
+        at, share = k // 1000, min(k % 1000 / 600, 1.0)
+        wanted = targets[at] + (targets[at + 1] - targets[at]) * share**2 * (3.0 - 2.0 * share)
+        return 400.0 * (wanted - state[:, :1]) - 14.0 * state[:, 1:2]
+
+    plants = joints.Plants(torque, stiffness, B, D, 0.45, 0.3, 3.0, more=pulled)
+    truth = joints.simulate(plants, follow, T, size=(N, 1, 1))
+    noise = np.random.default_rng(5).normal(0, 0.02, (N, 1))
+    record = joints.record(truth, 0, T, motor_counts=131072, link_bits=18, torque_noise=noise)
+    joint = joints.joint_model(B, D, model="unknown", order=None)
+    estimator = make_estimator(joint, EstimatorSettings(), T)
+    out = [estimator.step(sample) for sample in record.samples()]
+    assert all(one.status & Status.VALID and one.status & Status.TORQUE_VALID for one in out[4000:])
+    off = np.abs([one.stiffness_nm_rad for one in out] - truth.sigma[:, 0, 0])[4000:]
+    assert np.mean(off < 3.0 * np.array([one.stiffness_std_nm_rad for one in out])[4000:]) > 0.99
+    assert np.sqrt(np.mean((off / truth.sigma[4000:, 0, 0]) ** 2)) < 2e-3
+    lost = np.abs([one.flexibility_torque_nm for one in out] - truth.tau_e[:, 0, 0])[4000:]
+    assert np.max(lost) < 0.01 * np.sqrt(np.mean(truth.tau_e**2))
+    assert not any(estimator.undeclared())

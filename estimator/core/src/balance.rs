@@ -41,10 +41,12 @@ pub const READ: std::ops::Range<usize> = 21..23;
 pub const STOPS: std::ops::Range<usize> = 24..27;
 /// −(u clipped at four widths): a spring of any shape, N·m.
 pub const CLIPS: std::ops::Range<usize> = 27..31;
+/// −u |u|: a spring whose stiffness has a corner at zero, N·m.
+pub const CORNER: usize = 31;
 
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
-const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len(); // columns that are functions of the raw φ
+const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len() + 1; // columns that are functions of the raw φ
 const FORMED: usize = 9; // columns of lightly filtered signals: dry, soft, load ×2, late, read, stops ×3
 
 /// What the columns are scaled by, taken from the motion.
@@ -173,6 +175,7 @@ impl Balance {
             let width = width * self.size.range;
             *value = if width > 0.0 { -phi.clamp(-width, width) / self.size.range } else { 0.0 };
         }
+        out[CURVE - 1] = -self.unit(phi) * self.unit(phi).abs();
         out
     }
 
@@ -212,7 +215,7 @@ impl Balance {
         }
         (self.size.range, self.size.speed) = (range, self.speed);
         let columns = self.curve_columns(phi);
-        for lane in 2 * TERMS..CURVE {
+        for lane in 2 * TERMS..CURVE - 1 {
             for state in self.light.state.iter_mut().chain(&mut self.curve.state) {
                 state[lane] = 0.0;
             }
@@ -243,6 +246,8 @@ impl Balance {
         LOAD.iter().zip(&terms).for_each(|(column, factor)| factors[*column] = *factor);
         let mut curve = [1.0; CURVE];
         curve[..2 * TERMS].copy_from_slice(&terms);
+        let corner = (before / self.size.deflection).powi(2);
+        (factors[CORNER], curve[CURVE - 1]) = (corner, corner);
         self.light.scale(&curve);
         self.curve.scale(&curve);
         let slope = terms[TERMS + 1];
@@ -302,7 +307,8 @@ impl Balance {
         row[RATE] = self.position.main[1] - link.main[1];
         let curve = &self.curve.state[0];
         row[SPRING.start..SPRING.start + 2 * TERMS].copy_from_slice(&curve[..2 * TERMS]);
-        row[CLIPS].copy_from_slice(&curve[2 * TERMS..]);
+        row[CLIPS].copy_from_slice(&curve[2 * TERMS..CURVE - 1]);
+        row[CORNER] = curve[CURVE - 1];
         (row[LATE.start], row[READ.start]) = (-link.main[1], -link.main[0]);
         let formed = &self.formed.state[0];
         let places = [DRY, SOFT, LOAD[0], LOAD[1], LATE.start + 1, READ.start + 1];

@@ -38,10 +38,13 @@ pub const RATE: usize = 15;
 pub const STOPS: std::ops::Range<usize> = 16..19;
 /// A spring of any shape, N·m at half the range.
 pub const CLIPS: std::ops::Range<usize> = 19..23;
+/// A corner of the stiffness at zero, N·m at the largest deflection.
+pub const CORNER: std::ops::Range<usize> = 23..24;
 
 /// Those that every joint has.
 pub const ACTIVE: Set = (1 << SOFT) - 2;
 
+const USUAL: usize = 2; // powers that springs of which nothing is declared have
 const SHAPES: usize = 12; // of a law that are tried before any is known
 const NARROWEST: f64 = 0.05; // of them: the bend that a shape makes over the deflection seen …
 const WIDEST: f64 = 6.0; // … and the largest
@@ -83,11 +86,13 @@ pub struct Spring {
     pub size: usize,
     /// How many of them there are at least: evidence adds powers to a polynomial.
     pub least: usize,
-    ordered: bool, // how many powers there are is declared
+    series: bool, // of which nothing is declared
     /// Whether `alpha` is of any meaning.
     pub known: bool,
     /// α.
     pub alpha: Alpha,
+    /// Of φ |φ|, N·m/rad²: a corner of the stiffness at zero that a series of odd powers lacks.
+    corner: f64,
     /// Where φ is zero, rad: f(φ + zero).
     pub zero: f64,
     declared: bool,
@@ -126,13 +131,15 @@ impl Spring {
             covariance
         });
         let declared = n > 0;
+        let series = matches!(law, Law::Polynomial) && !declared && order.is_none();
         Spring {
             law,
             size,
             least,
-            ordered: n > 0 || order.is_some(),
+            series,
             known: declared,
             alpha,
+            corner: 0.0,
             zero: 0.0,
             declared,
             anchored: declared,
@@ -144,6 +151,7 @@ impl Spring {
     /// Back to what is declared.
     pub fn reset(&mut self) {
         (self.alpha, self.zero, self.known, self.anchored) = (self.start, 0.0, self.declared, self.declared);
+        self.corner = 0.0;
     }
 
     /// It has changed: what is declared is no measure any more.
@@ -157,10 +165,16 @@ impl Spring {
         self.anchored
     }
 
+    /// The unknowns of the terms that a series may have.
+    #[must_use]
+    pub fn shape(&self) -> Set {
+        if self.series { set(SPRING) | set(CORNER) } else { set(SPRING) }
+    }
+
     /// Whether these unknowns hold more powers than are declared.
     #[must_use]
     pub fn is_longer(&self, of: Set) -> bool {
-        self.ordered && of & set(SPRING.start + self.least..SPRING.end) != 0
+        !self.series && of & set(SPRING.start + self.least..SPRING.end) != 0
     }
 
     /// α of this law alone.
@@ -223,8 +237,8 @@ impl Spring {
         if self.is_linear() { [0.0; PARAMETERS] } else { self.alpha }
     }
 
-    /// Move to the parameters that a solution has found; what cannot be is cut off.
-    pub fn move_by(&mut self, x: &Vector) {
+    /// Move to the parameters that a solution has found; what cannot be is cut off. `size`: of the columns, rad.
+    pub fn move_by(&mut self, x: &Vector, size: f64) {
         let base = self.base();
         for (i, unknown) in SPRING.enumerate().take(self.size) {
             self.alpha[i] = base[i] + x[unknown];
@@ -235,6 +249,7 @@ impl Spring {
             *value = value.clamp(shape.low + near.0, (shape.low + near.1).min(shape.high));
         }
         self.zero += x[ZERO];
+        self.corner = x[CORNER.start] / size.powi(2);
         self.known = true;
     }
 
@@ -269,6 +284,7 @@ impl Spring {
             (DRY, balance::DRY),
             (SOFT, balance::SOFT),
             (RATE, balance::RATE),
+            (CORNER.start, balance::CORNER),
         ];
         let ranges =
             STOPS.zip(balance::STOPS).chain(CLIPS.zip(balance::CLIPS)).chain(LOAD.zip(balance::LOAD));
@@ -289,10 +305,14 @@ impl Spring {
             place(&mut frame.left, &self.torque(projection), -1.0);
         }
         let slope = self.slope(projection);
-        place(&mut frame.directions[ZERO], &slope, 1.0);
+        let moved = projection.of(|phi| self.law.at(phi + self.zero, alpha).1);
+        place(&mut frame.directions[ZERO], &moved, 1.0);
         (frame.directions[LATE], frame.set) = (late(&slope, balance::LATE.start), set(1..UNKNOWNS));
         for unknown in SPRING.skip(self.size) {
             frame.set &= !(1 << unknown);
+        }
+        if !self.series {
+            frame.set &= !set(CORNER);
         }
         if slope.iter().all(|s| *s == 0.0) {
             frame.set &= !(1 << ZERO | 1 << LATE);
@@ -300,10 +320,16 @@ impl Spring {
         frame
     }
 
+    /// τ_e and σ of the law, whose zero may be elsewhere, and of the corner, which stays where it is declared.
+    fn curve(&self, phi: f64) -> (f64, f64) {
+        let (torque, stiffness) = self.law.at(phi + self.zero, self.parameters());
+        (torque + self.corner * phi * phi.abs(), stiffness + 2.0 * self.corner * phi.abs())
+    }
+
     /// τ_e as a sum of the family's functions.
     #[must_use]
     pub fn torque(&self, projection: &Projection) -> Coefficients {
-        projection.of(|phi| self.law.at(phi + self.zero, self.parameters()).0)
+        projection.of(|phi| self.curve(phi).0)
     }
 
     /// rms of τ_e over some rows, N·m.
@@ -317,7 +343,7 @@ impl Spring {
     /// σ as a sum of the family's functions.
     #[must_use]
     pub fn slope(&self, projection: &Projection) -> Coefficients {
-        projection.of(|phi| self.law.at(phi + self.zero, self.parameters()).1)
+        projection.of(|phi| self.curve(phi).1)
     }
 
     /// What is believed of the unknowns before any data, in the scale of these rows.
@@ -339,6 +365,9 @@ impl Spring {
             let share = if gear { priors.load_dependent_friction } else { priors.undeclared };
             std[unknown] = share * torque / rms(unknown);
         }
+        if self.series {
+            std[CORNER.start] = priors.spring * torque / rms(CORNER.start);
+        }
         let inertia = motor.inertia_std.unwrap_or(priors.motor_inertia);
         (mean[INERTIA], std[INERTIA]) = (motor.inertia, inertia * motor.inertia);
         mean[DAMPING] = motor.damping;
@@ -351,7 +380,7 @@ impl Spring {
         let shapes = self.law.shapes();
         for (i, unknown) in SPRING.enumerate().take(self.size) {
             mean[unknown] = if self.anchored { self.start[i] - base[i] } else { 0.0 };
-            let undeclared = self.ordered && i >= self.least;
+            let undeclared = i >= if self.series { USUAL } else { self.least };
             std[unknown] = match (self.anchored, i.checked_sub(1).and_then(|k| shapes.get(k))) {
                 _ if undeclared => priors.undeclared * torque / rms(unknown),
                 (true, Some(shape)) => priors.law * (self.start[i] - shape.low),

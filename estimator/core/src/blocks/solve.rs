@@ -16,7 +16,9 @@ const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the
 const WIDE: f64 = 1e6; // of a prior that says nothing
 const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
 
-type Groups = [Set; CANDIDATES.len() + SPRING.end - SPRING.start];
+const ALONE: usize = CANDIDATES.len() + SPRING.end - SPRING.start; // groups that are not several others
+
+type Groups = [Set; ALONE + SPRING.end - SPRING.start];
 
 impl Blocks {
     pub(super) fn prior(&self, total: &Gram, frame: &Frame, zero_std: f64) -> Prior {
@@ -188,7 +190,7 @@ impl Blocks {
             });
             let before = chosen.x;
             self.residual = frame.residual(&chosen.x, chosen.set);
-            self.spring.move_by(&before);
+            self.spring.move_by(&before, self.deflection);
             if step + 1 < STEPS && far && !self.spring.is_settled() {
                 continue;
             }
@@ -252,8 +254,13 @@ impl Blocks {
         }
         let (least, size) = (self.spring.least, self.spring.size);
         base &= !set(SPRING.start + least..SPRING.end);
-        for (group, more) in groups[CANDIDATES.len()..].iter_mut().zip(least + 1..=size) {
-            *group = set(SPRING.start..SPRING.start + more);
+        // Terms of an open series are chosen together: one may stand for another.
+        let corner = self.spring.shape() & !set(SPRING);
+        groups[ALONE - 1] = corner;
+        for (i, more) in (least + 1..=size).enumerate() {
+            let terms = set(SPRING.start..SPRING.start + more);
+            groups[CANDIDATES.len() + i] = terms;
+            groups[ALONE + i] = if corner == 0 { 0 } else { terms | corner };
         }
         (base, groups)
     }
@@ -277,12 +284,23 @@ impl Blocks {
             // The zero is where it is declared, or anywhere in the range.
             let log = log_evidence(reduced, found, prior, noise);
             let elsewhere = self.prior(total, frame, self.deflection);
+            groups[ALONE - 1..].fill(0); // a corner is at the declared zero
             let other = choose(reduced, base, &groups, &elsewhere, noise);
             if log_evidence(reduced, other, &elsewhere, noise) > log + (groups.len() as f64).ln() {
-                return solve(reduced, other, &elsewhere, noise).map(|found| (found, true));
+                let found = solve(reduced, other, &elsewhere, noise)?;
+                if self.is_seen(self.spring.zero + found.x[ZERO]) {
+                    return Some((found, true));
+                }
             }
         }
         solve(reduced, found, prior, noise).map(|found| (found, false))
+    }
+
+    /// Whether a zero that has moved by so much can be told from another curve: one whose law is open only where
+    /// deflections reach as far beyond it to either side.
+    fn is_seen(&self, moved: f64) -> bool {
+        let [low, high] = self.seen;
+        !self.spring.law.is_polynomial() || self.spring.is_anchored() || 2.0 * moved.abs() < high.min(-low)
     }
 
     /// What the groups that were not chosen, or a zero elsewhere, may change: the covariance between models, by their
@@ -302,11 +320,11 @@ impl Blocks {
         let (_, groups) = self.groups(frame);
         let many = groups.iter().filter(|group| **group != 0).count() as f64;
         let elsewhere = self.prior(total, frame, self.deflection);
-        let left_out = groups.iter().filter(|group| *group & !chosen.set & frame.set != 0);
+        let left_out = groups[..ALONE].iter().filter(|group| *group & !chosen.set & frame.set != 0);
         let rivals = left_out.map(|group| (chosen.set | group, prior)).chain([(chosen.set, &elsewhere)]);
         for (set, prior) in rivals {
             // An effect is as rare as there are many; that a series goes on where it is cut off is as likely as not.
-            let usual = if set & !chosen.set & self::set(SPRING) == 0 { many.recip() } else { 1.0 };
+            let usual = if set & !chosen.set & self.spring.shape() == 0 { many.recip() } else { 1.0 };
             let odds = usual * (log_evidence(reduced, set, prior, noise) - chosen.log_evidence).exp();
             let probability = odds / (1.0 + odds);
             if probability < EVEN {

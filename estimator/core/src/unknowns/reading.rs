@@ -1,6 +1,6 @@
 //! Torque and stiffness that the unknowns make at a deflection.
 
-use super::{CLIPS, LATE, SPRING, STOPS, Spring, ZERO};
+use super::{CLIPS, CORNER, LATE, SPRING, STOPS, Spring, ZERO};
 use crate::balance;
 use crate::balance::Balance;
 use crate::gram::{Set, UNKNOWNS, Vector};
@@ -29,14 +29,21 @@ impl Spring {
     /// `late_s` and `link_rate`: the position that was read late is brought up by them.
     #[must_use]
     pub fn at(&self, phi: f64, x: &Vector, set: Set, link_rate: f64, balance: &Balance) -> Reading {
-        let at = phi + self.zero + x[LATE] * link_rate;
-        let (mut torque, mut stiffness) = self.law.at(at, self.parameters());
+        let now = phi + x[LATE] * link_rate;
+        let (mut torque, mut stiffness) = self.curve(now);
+        let at = now + self.zero;
         let (mut by_torque, mut by_stiffness) = ([0.0; UNKNOWNS], [0.0; UNKNOWNS]);
         let (mut f, mut s) = ([0.0; PARAMETERS], [0.0; PARAMETERS]);
         self.law.jacobian(at, self.parameters(), &mut f[..self.size]);
-        let bend = self.law.stiffness_slopes(at, self.parameters(), &mut s[..self.size]);
+        let bend = self.law.stiffness_slopes(at, self.parameters(), &mut s[..self.size])
+            + 2.0 * self.corner * now.signum();
         by_torque[SPRING.start..SPRING.start + self.size].copy_from_slice(&f[..self.size]);
         by_stiffness[SPRING.start..SPRING.start + self.size].copy_from_slice(&s[..self.size]);
+        if set & crate::gram::set(CORNER) != 0 {
+            let square = balance.size.deflection.powi(2);
+            by_torque[CORNER.start] = now * now.abs() / square;
+            by_stiffness[CORNER.start] = 2.0 * now.abs() / square;
+        }
         (by_torque[ZERO], by_stiffness[ZERO]) = (stiffness, bend);
         (by_torque[LATE], by_stiffness[LATE]) = (stiffness * link_rate, bend * link_rate);
         if set & (crate::gram::set(STOPS) | crate::gram::set(CLIPS)) != 0 {

@@ -89,3 +89,18 @@ class PlainFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Return the record's lines."""
         return "\n".join(clean_text(line) for line in super().format(record).split("\n"))
+
+
+class _Stamped(PlainFormatter):
+    """Formats log records as lines with the time of day."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record's lines."""
+        return "\n".join(stamped(line, sys.stderr, 11) for line in super().format(record).split("\n"))
+
+
+def log_to_stderr(level: int) -> None:
+    """Log from this level on to stderr, as a daemon and the processes beside it do."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Stamped("%(levelname).1s %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler])

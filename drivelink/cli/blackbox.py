@@ -22,6 +22,7 @@ from drivelink.jointfile import JointFile
 from drivelink.loop.blackbox import BlackBox
 from drivelink.loop.finding import folder_of
 from drivelink.loop.queue import Diagnoses
+from drivelink.plaintext import log_to_stderr
 from drivelink.recording.recorder import Recorder
 
 _LOG = logging.getLogger("drivelink.recording")
@@ -83,7 +84,7 @@ def main() -> int:
     parser.add_argument("joint", type=Path)
     add_bus(parser)
     args = parser.parse_args()
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname).1s %(message)s")
+    log_to_stderr(logging.INFO)
     logging.getLogger("can").setLevel(logging.CRITICAL)  # some interfaces log every partial read
     os.nice(_NICE)
     ended = threading.Event()

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from drivelink.cli import ALONE, add_bus, add_seconds, handling, moved
 from drivelink.jointfile import BusSection, load
-from drivelink.plaintext import PlainFormatter, stamped
+from drivelink.plaintext import log_to_stderr, stamped
 
 if TYPE_CHECKING:
     from drivelink.daemon.service import Daemon
@@ -114,9 +114,7 @@ def _say_ready(names: list[str], bus: BusSection, args: argparse.Namespace) -> N
 
 
 def _set_up_logging(level: str) -> None:
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_Stamped("%(levelname).1s %(message)s"))
-    logging.basicConfig(level=getattr(logging, level.upper()), handlers=[handler])
+    log_to_stderr(getattr(logging, level.upper()))
     logging.getLogger("canopen").setLevel(logging.ERROR)
 
 
@@ -128,14 +126,6 @@ def _show(daemon: Daemon, ended: threading.Event) -> None:
 def _say(text: str) -> None:
     for line in text.splitlines():
         print(stamped(line, sys.stdout), flush=True)
-
-
-class _Stamped(PlainFormatter):
-    """Formats log records as lines with the time of day."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the record's lines."""
-        return "\n".join(stamped(line, sys.stderr, 11) for line in super().format(record).split("\n"))
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from drivelink.loop.finding import page_file, proposal_file
 from drivelink.output import report, sentences
 from drivelink.output.comparison import simulated
 from drivelink.output.numbers import Units
+from drivelink.plaintext import log_to_stderr
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
 from estimator.diagnosis import Diagnosis, Errors, diagnose
@@ -207,7 +208,7 @@ def _unix_s(recording: Path, record: Record, sequence: int) -> float:
 def main() -> int:
     """Diagnose one recording; whatever comes of it lies beside it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal, for the daemon: the black box ends this
-    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(levelname).1s %(message)s")
+    log_to_stderr(logging.WARNING)
     os.nice(19)
     with suppress(OSError, AttributeError):  # not every system has it
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

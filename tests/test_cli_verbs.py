@@ -11,6 +11,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import diagnosiskit
+import fleetkit
+import joints
 import pytest
 
 from drivelink import cli
@@ -163,10 +166,10 @@ def test_new_sim_and_service_print_one_object(tmp_path, capsys):
     assert set(removed["removed"]) == set(installed["written"])
 
 
-def test_a_console_without_unicode_gets_the_words_spelt_out(fleet, tmp_path):
-    whole, joint = fleet / "recordings" / "elbow-2026-01-05.csv", fleet / "joints" / "elbow.toml"
-    run = tmp_path / "run.csv"
-    run.write_text("".join(whole.read_text().splitlines(keepends=True)[:4000]))
+def test_a_console_without_unicode_gets_the_words_spelt_out(tmp_path):
+    run, joint = tmp_path / "run.csv", tmp_path / "elbow.toml"
+    joints.write_csv(diagnosiskit.World([{}], seconds=4.0).run()[0], run)
+    joint.write_text(fleetkit.JOINT.format(name="elbow"))
     command = [sys.executable, "-m", "drivelink", "fit", str(run), "--joint", str(joint)]
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)

@@ -29,7 +29,12 @@ def run(*command, **options):
     [
         ("subscribe_latest.py", r"live     gain    70\.0 N·m/rad", "1000"),
         ("subscribe_wait.py", "in control from cycle", "1000"),
-        ("subscribe_async.py", r"elbow: cycle \d*[05]00, 700\.0 N·m/rad, running", "1000"),
+        pytest.param(
+            "subscribe_async.py",
+            r"elbow: cycle \d*[05]00, 700\.0 N·m/rad, running",
+            "1000",
+            marks=pytest.mark.slow,
+        ),
         ("subscribe_numpy.py", "stiffness 700.0 N·m/rad", "0.5"),
     ],
 )

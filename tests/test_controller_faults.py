@@ -28,13 +28,13 @@ NO_TORQUE = (0.0, 0.0)
 
 
 def test_it_goes_to_its_targets_and_when_it_is_dead_the_drives_end_the_torque():
-    with kit.running(seconds=1.7, rest_s=1.0) as rig:
+    with kit.running(seconds=1.3, rest_s=0.6) as rig:
         targets = rig.controller.settings.targets
         for q, sigma in (*targets, targets[0]):
             truth = rig.world.truth()
             assert truth.link_position_rad == pytest.approx(q, abs=0.02)
             assert truth.stiffness_nm_rad == pytest.approx(sigma, abs=0.04)
-            rig.run(1.8)
+            rig.run(1.4)
         assert [phase for phase, _, _ in rig.events] == ["identify", "run"]  # nothing interrupts it
         rig.daemon.run_lockstep(150)  # the controller has stopped
         # The drives watch the master's heartbeat (0x1016) and switch off by themselves (0x6007).

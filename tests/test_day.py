@@ -120,6 +120,7 @@ def test_the_page_links_events_to_recording_and_diagnosis(tmp_path):
     assert not recording.exists() and not page_file(recording).exists() and newer.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
 def test_the_page_of_a_short_day_can_be_read_on_a_phone(tmp_path):
     Written(tmp_path).run(200)

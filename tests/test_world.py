@@ -91,6 +91,7 @@ def test_each_effect_leaves_in_the_balance_of_the_motor_what_it_is(effect, law, 
     assert np.quantile(off[np.abs(speed[101:-1]) > where], 0.5 if "lugre" in effect else 1.0) < 0.01
 
 
+@pytest.mark.slow
 def test_a_hand_that_moves_a_healthy_joint_shows_no_other_inertia():
     """The motor's torque is small: inertia and stiffness scaled down alike leave less, and explain nothing."""
     settings = (

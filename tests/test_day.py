@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import urllib.error
 import urllib.request
 from datetime import UTC, datetime
@@ -48,6 +49,14 @@ def test_rows_of_a_clock_that_was_wrong_are_not_of_the_last_day(tmp_path):
     assert table[:, 0].tolist() == sorted(BEGIN_S + s for s in (*range(1, 151), *range(101, 151)))
 
 
+def test_a_folder_that_was_removed_is_made_again(tmp_path):
+    written = Written(tmp_path / "kept")
+    for _ in range(2):
+        written.run(3)
+        assert len(day.rows(tmp_path / "kept", "elbow")) == 3
+        shutil.rmtree(tmp_path / "kept")
+
+
 def kept_one(folder: Path) -> Path:
     recording = folder / recording_name("elbow", "model alarm", datetime.fromtimestamp(BEGIN_S + 60, UTC))
     recording.write_bytes(b"mcap")
@@ -73,13 +82,14 @@ def test_a_row_a_second_in_two_files_of_bounded_size(tmp_path, monkeypatch):
     assert len(thin) <= 21 and all(row[1] == 700.0 and 0.5 < (row[3] or 0.0) < 1.0 for row in thin)
 
 
-def test_a_full_disk_is_one_line(tmp_path, caplog):
-    written = Written(tmp_path / "missing")
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, caplog):
+    (folder := tmp_path / "kept").touch()  # in whose place a file is
+    written = Written(folder)
     written.run(5)
     assert len(caplog.records) == 1
-    (tmp_path / "missing").mkdir()
+    folder.unlink()
     written.run(1)
-    assert len(day.rows(tmp_path / "missing", "elbow")) == 1
+    assert len(day.rows(folder, "elbow")) == 1
 
 
 def test_the_page_links_events_to_recording_and_diagnosis(tmp_path):

@@ -81,7 +81,8 @@ class Day:
             self._failed = True
 
     def _append(self, line: str) -> None:
-        """Add a line; a file of a day's rows gives way to a new one."""
+        """Add a line; a file of a day's rows gives way to a new one, and a removed folder is made."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
         if self._path.exists() and self._path.stat().st_size >= _MOST // 2:
             self._path.replace(self._before)
         with self._path.open("a", encoding="ascii") as file:

@@ -278,8 +278,7 @@ def test_asyncio_waits_iterates_and_times_out(publisher, endpoint):
 @pytest.fixture
 def hasty(monkeypatch):
     for module in ("clientbase", "client"):
-        monkeypatch.setattr(f"drivelink.pubsub.{module}.PATIENCE_S", 0.2)
-    monkeypatch.setattr("drivelink.pubsub.clientbase._ANSWER_S", 0.3)
+        monkeypatch.setattr(f"drivelink.pubsub.{module}.PATIENCE_S", 0.3)
 
 
 @pytest.mark.parametrize("how", ["wait", "latest", "async"])

@@ -245,9 +245,9 @@ def test_in_a_terminal_question_mark_shows_the_legend_and_q_quits(daemon):
 
 
 def test_a_joint_that_nobody_serves_is_not_live_and_the_nearest_is_named(daemon, capsys, monkeypatch):
-    monkeypatch.setattr("drivelink.monitor.watcher.PATIENCE_S", 0.2)
+    monkeypatch.setattr("drivelink.monitor.watcher.PATIENCE_S", 0.3)
     assert (
-        cli.main(["monitor", "elbwo", "--endpoint", daemon, "--every", "0.3", "--seconds", "1.2", "--json"])
+        cli.main(["monitor", "elbwo", "--endpoint", daemon, "--every", "0.3", "--seconds", "1.6", "--json"])
         == 6
     )
     displayed = json.loads(capsys.readouterr().out.splitlines()[-1])

@@ -43,6 +43,7 @@ RANGES: dict[str, Range] = {  # the longest end that fits counts
     "_rad_s_per_count": Range(1e-15, 1e6, "rad/s"),
     "_nm": Range(1e-12, 1e9, "N·m"),
     "_nm_rad": Range(1e-9, 1e12, "N·m/rad"),
+    "coefficients_nm_rad": Range(1e-9, 1e30, "N·m/rad, N·m/rad³, …"),  # the ninth power of 1 mrad is 1e-27
     "_nm_rad2": Range(1e-9, 1e12, "N·m/rad²"),
     "_nm_s_rad": Range(1e-12, 1e9, "N·m·s/rad"),
     "_nm_s2_rad2": Range(1e-12, 1e9, "N·m·s²/rad²"),
@@ -63,7 +64,7 @@ RANGES: dict[str, Range] = {  # the longest end that fits counts
     "bitrate": Range(1e3, 2e7, "bit/s"),
     "sdo_retries": Range(0.0, 100.0, ""),
     "elements": Range(1.0, 32.0, ""),  # numbers of a parameter: each costs time in every cycle
-    "covariance": Range(0.0, 1e24, ""),  # of two parameters of up to 1e12 each
+    "covariance": Range(0.0, 1e60, ""),  # of two parameters of up to 1e30 each
     "correlation": Range(1e-6, 1.0, ""),  # least: digits that a file may leave out
     "every": Range(1.0, 1e6, ""),
     "seed": Range(0.0, 2.0**63, ""),

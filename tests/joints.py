@@ -156,6 +156,30 @@ def simulate(
     return Truth(*motors, q, q_rate, held, scales * plants.torque(phi), scales * plants.stiffness(phi))
 
 
+def pulled(
+    torque: Callable[[Array], Array], stiffness: Callable[[Array], Array], pull: float, n: int, seed: int = 0
+) -> tuple[Truth, Record]:
+    """A joint of 0.12 kg·m² and 0.8 N·m·s/rad that goes from place to place, its link pulled by a weight or another
+    spring: the deflection stays on one side. The truth, and what fine encoders and a noisy drive read."""
+    period_s, load = 1e-3, 0.45
+    places = np.random.default_rng(seed).uniform(-0.6, 0.6, n // 1000 + 2)
+
+    def more(_t: float, _state: Array, rate: Array, _tau: Array) -> None:
+        rate[:, 3] += pull / load
+
+    def follow(k: int, state: Array) -> Array:
+        at, share = k // 1000, min(k % 1000 / 600, 1.0)
+        wanted = places[at] + (places[at + 1] - places[at]) * share**2 * (3.0 - 2.0 * share)
+        return np.asarray(400.0 * (wanted - state[:, :1]) - 14.0 * state[:, 1:2])
+
+    truth = simulate(
+        Plants(torque, stiffness, 0.12, 0.8, load, 0.3, 3.0, more=more), follow, period_s, size=(n, 1, 1)
+    )
+    noise = np.random.default_rng(5).normal(0, 0.02, (n, 1))
+    how = {"motor_counts": 131072, "link_bits": 18, "velocity_rad_s": None, "torque_noise": noise}
+    return truth, record(truth, 0, period_s, **how)
+
+
 def quantise(x: Array, step: float) -> Array:
     return np.floor(x / step) * step if step else x
 

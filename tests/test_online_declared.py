@@ -123,22 +123,7 @@ def test_powers_beyond_the_declared_order_are_found_and_named():
 def test_an_unknown_spring_may_have_a_corner_and_be_bent_to_one_side(pull):
     """A weight, or the other spring of an antagonistic pair, keeps the deflection on one side: there a zero that has
     moved cannot be told from another curve, and moving it made torques wrong by a tenth and more of theirs."""
-    torque, stiffness, _ = SPRINGS["exponential"]
-
-    def pulled(_t, _state, rate, _tau):
-        rate[:, 3] += pull / 0.45
-
-    targets = np.random.default_rng(0).uniform(-0.6, 0.6, N // 1000 + 2)
-
-    def follow(k, state):
-        at, share = k // 1000, min(k % 1000 / 600, 1.0)
-        wanted = targets[at] + (targets[at + 1] - targets[at]) * share**2 * (3.0 - 2.0 * share)
-        return 400.0 * (wanted - state[:, :1]) - 14.0 * state[:, 1:2]
-
-    plants = joints.Plants(torque, stiffness, B, D, 0.45, 0.3, 3.0, more=pulled)
-    truth = joints.simulate(plants, follow, T, size=(N, 1, 1))
-    noise = np.random.default_rng(5).normal(0, 0.02, (N, 1))
-    record = joints.record(truth, 0, T, motor_counts=131072, link_bits=18, torque_noise=noise)
+    truth, record = joints.pulled(*SPRINGS["exponential"][:2], pull, N)
     joint = joints.joint_model(B, D, model="unknown", order=None)
     estimator = make_estimator(joint, EstimatorSettings(), T)
     out = [estimator.step(sample) for sample in record.samples()]

@@ -88,6 +88,11 @@ class Judge:
     def _explained(self, effects: list[Finding], curve: Fitted | None) -> _Judged:
         """The verdict on the effects found, or on a free curve that explains more than they do."""
         before = self._declared(effects)
+        if effects and not self.found.terms and not self.held.confirms(self.found, before):
+            effects, before = (
+                [],
+                self._declared([]),
+            )  # a reading is off, and nothing held out is the better for it
         if curve is None or not self._unlisted(curve):
             curve = self._remaining()
         if curve is not None and (extra := curve.extra) is not None:

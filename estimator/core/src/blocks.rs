@@ -84,6 +84,8 @@ pub struct Blocks {
     pub spoilt: bool,
     /// Variance of a row that the readings' white noise makes, (N·m)².
     pub white: f64,
+    /// That of the positions' noise alone, which is in the columns, (N·m)².
+    pub rounding: f64,
     /// Resolution of the deflection, rad: rounding moves its zero by as much.
     pub resolution: f64,
     /// The least and the largest deflection since they are counted from where they are, rad.
@@ -152,6 +154,7 @@ impl Blocks {
             odds: None,
             spoilt: false,
             white: 0.0,
+            rounding: 0.0,
             resolution: 0.0,
             seen: [0.0; 2],
             family: Family::of(Some(&spring.law)),

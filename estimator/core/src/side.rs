@@ -300,8 +300,9 @@ impl Side {
         let positions = noise[0] + noise[1];
         self.blocks.seen = self.balance.seen();
         self.blocks.resolution = (12.0 * positions).sqrt();
-        self.blocks.white = gains[0] * (torque_noise + self.stiffness.powi(2) * positions)
-            + gains[2] * self.inertia.powi(2) * noise[0];
+        self.blocks.rounding =
+            gains[0] * self.stiffness.powi(2) * positions + gains[2] * self.inertia.powi(2) * noise[0];
+        self.blocks.white = self.blocks.rounding + gains[0] * torque_noise;
         let row = self.balance.row(link);
         let closed = self.blocks.add(&row)?;
         let doubted = self.doubtful;

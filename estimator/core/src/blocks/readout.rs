@@ -2,9 +2,9 @@
 
 use super::Blocks;
 use crate::balance::Balance;
-use crate::choices::{BLOCKS, SURE, UNUSUAL, USEFUL};
+use crate::choices::{BLOCKS, UNUSUAL, USEFUL};
 use crate::gram::{UNKNOWNS, set};
-use crate::unknowns::{CANDIDATES, DAMPING, INERTIA, LATE, OFFSET, RATE, Reading};
+use crate::unknowns::{CANDIDATES, LATE, OFFSET, RATE, Reading};
 
 impl Blocks {
     /// Delay of the link position, s, and its standard deviation.
@@ -62,17 +62,6 @@ impl Blocks {
         self.unexplained < USEFUL && self.unexplained <= UNUSUAL.sqrt() * usual
     }
 
-    /// Whether the balance is that of a controller: where the torque is made from what is measured, as of a joint that is
-    /// guided by hand, it is explained by less than the declared inertia and a damping below zero, whatever the spring is.
-    #[must_use]
-    pub fn is_no_motor(&self) -> bool {
-        let Some(known) = self.posterior.as_ref().filter(|known| known.set >> INERTIA & 1 == 1) else {
-            return false;
-        };
-        let std = self.motor.inertia_std.unwrap_or(0.0).max(self.priors.motor_inertia);
-        known.x[INERTIA] < (1.0 - SURE * std) * self.motor.inertia && known.x[DAMPING] < 0.0
-    }
-
     /// rms of what the balance has left over the last moments, N·m.
     #[must_use]
     pub fn misfit(&self) -> f64 {
@@ -85,37 +74,5 @@ impl Blocks {
         let named = CANDIDATES.iter().filter(move |c| chosen & set(c.unknowns.clone()) != 0).map(|c| c.name);
         let longer = self.spring.is_longer(chosen).then_some("higher_order_stiffness");
         named.chain(longer).chain(self.moved.then_some("deflection_offset"))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::gram::Posterior;
-    use crate::model::{Motor, Transmission};
-    use crate::settings::Priors;
-
-    #[test]
-    fn less_than_the_declared_inertia_and_a_damping_below_zero_are_a_controllers() {
-        let motor = Motor {
-            inertia: 0.1,
-            inertia_std: None,
-            damping: 1.0,
-            damping_std: None,
-            fit_rms: None,
-            transmission: Transmission::Unknown,
-            effects: Vec::new(),
-        };
-        let mut blocks = Blocks::new(&motor, &Priors::USUAL, 1e-3, 100.0, 75, 1.0);
-        assert!(!blocks.is_no_motor());
-        for (inertia, damping, none) in
-            [(0.1, -0.5, false), (0.09, -0.5, false), (0.03, 0.1, false), (0.03, -0.5, true)]
-        {
-            let mut x = [0.0; UNKNOWNS];
-            (x[INERTIA], x[DAMPING]) = (inertia, damping);
-            let covariance = [[0.0; UNKNOWNS]; UNKNOWNS];
-            blocks.posterior = Some(Posterior { set: set(1..UNKNOWNS), x, covariance, log_evidence: 0.0 });
-            assert_eq!(blocks.is_no_motor(), none, "{inertia} {damping}");
-        }
     }
 }

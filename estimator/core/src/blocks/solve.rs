@@ -10,7 +10,9 @@ use crate::gram::{
 use crate::laws::{Law, PARAMETERS};
 use crate::spring::Projection;
 use crate::student::t_95;
-use crate::unknowns::{ACTIVE, CANDIDATES, DRY, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO};
+use crate::unknowns::{
+    ACTIVE, CANDIDATES, DRY, INERTIA, LATE, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO,
+};
 
 const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
 const WIDE: f64 = 1e6; // of a prior that says nothing
@@ -196,9 +198,11 @@ impl Blocks {
             }
             self.friction = frame.rms(&total, &chosen, set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS));
             let omitted = self.omitted(&frame, &reduced, &total, &chosen, &used, noise);
+            let attenuated = self.attenuated(&chosen, total.rows, noise);
             self.widen(&frame, &mut chosen, &used, noise, own);
-            let entries = chosen.covariance.iter_mut().flatten().zip(omitted.iter().flatten());
-            entries.for_each(|(v, more)| *v += more);
+            let more = omitted.iter().flatten().zip(attenuated.iter().flatten());
+            let entries = chosen.covariance.iter_mut().flatten().zip(more);
+            entries.for_each(|(v, (omitted, attenuated))| *v += omitted + attenuated);
             self.torque = self.spring.torque_rms(&projection, &total);
             (self.posterior, self.frame) = (Some(chosen), Some(frame));
             break;
@@ -339,6 +343,25 @@ impl Blocks {
             }
         }
         between
+    }
+
+    /// Errors in variables: noise of the positions is in the columns, and takes its share off all that multiplies them: its
+    /// power over what tells of their scale. Where the torque is hardly more than what is measured of the motion makes
+    /// it, as of a joint that is guided by hand, that is much of it.
+    fn attenuated(&self, chosen: &Posterior, rows: f64, noise: f64) -> Matrix {
+        let mut scale = chosen.x;
+        for (i, unknown) in SPRING.enumerate() {
+            scale[unknown] =
+                if i == 0 || self.spring.law.is_polynomial() { self.spring.alpha[i] } else { 0.0 };
+        }
+        (scale[ZERO], scale[LATE]) = (0.0, 0.0);
+        let open = chosen.covariance[INERTIA][INERTIA] / chosen.x[INERTIA].powi(2);
+        let share = (self.rounding * rows / noise * open).min(1.0);
+        let mut out = [[0.0; UNKNOWNS]; UNKNOWNS];
+        for i in unknowns(chosen.set) {
+            unknowns(chosen.set).for_each(|j| out[i][j] = share * share * scale[i] * scale[j]);
+        }
+        out
     }
 
     /// What the chosen unknowns leave beyond the noise is an error of the model: scores of blocks hold it.

@@ -89,9 +89,6 @@ impl Side {
         if !self.fits {
             return Some(Reason::Unexplained(self.unexplained));
         }
-        if self.blocks.is_no_motor() {
-            return Some(Reason::Motor);
-        }
         let reach = (GROWN * self.balance.largest()).min(REACHED * self.blocks.spring.reach());
         let phi = part.deflection - self.blocks.spring.zero;
         let within = phi.abs() < if reach > 0.0 { reach } else { f64::INFINITY };

@@ -29,7 +29,6 @@ REASONS: dict[str, str] = {
     "imprecise": "stiffness known to ± {share} %, asked for ± {asked:.2g} %",
     "torque_imprecise": "torque known to ± {share} % of its rms, asked for ± {asked:.2g} %",
     "not_positive": "the stiffness comes out at or below zero: check signs, torque and inertia",
-    "motor": "no motor of the declared inertia and damping fits the motion",
     "unexplained": "the model leaves {share} % of the torque balance unexplained",
     "beyond": "the deflection is larger than any that was learned from",
     "changed": "{changes} changed",

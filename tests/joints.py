@@ -180,6 +180,27 @@ def pulled(
     return truth, record(truth, 0, period_s, **how)
 
 
+def guided(
+    torque: Callable[[Array], Array], stiffness: Callable[[Array], Array], n: int
+) -> tuple[Truth, Record]:
+    """A joint of 0.12 kg·m² and 0.8 N·m·s/rad that a hand moves while its drive only damps: the truth, and what is read."""
+    rng, load = np.random.default_rng(0), 0.55
+    hz, phase = rng.uniform(0.2, 3.0, 8), rng.uniform(0.0, 2.0 * np.pi, 8)
+
+    def hand(t: float, _state: Array, rate: Array, _tau: Array) -> None:
+        rate[:, 3] += 5.0 * np.sum(np.sin(2.0 * np.pi * hz * t + phase)) / np.sqrt(8.0) / load
+
+    def damp(_k: int, state: Array) -> Array:
+        return np.asarray(-0.33 * state[:, 1:2])
+
+    truth = simulate(
+        Plants(torque, stiffness, 0.12, 0.8, load, 0.13, 0.02, more=hand), damp, 1e-3, size=(n, 1, 1)
+    )
+    noise = np.random.default_rng(5).normal(0, 0.0125, (n, 1))
+    how = {"motor_counts": 8192, "link_bits": 17, "velocity_rad_s": None}
+    return truth, record(truth, 0, 1e-3, **how, torque_noise=noise)
+
+
 def quantise(x: Array, step: float) -> Array:
     return np.floor(x / step) * step if step else x
 

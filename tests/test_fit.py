@@ -195,3 +195,11 @@ def test_what_is_left_shows_friction_as_a_step_and_hysteresis_as_a_loop(tmp_path
     assert 1.0 < up - down < 2.0  # the loop is 2 N·m wide where the motion is longer than its 0.01 rad
     joint = jointfile.parse(fleetkit.JOINT.format(name="elbow"))
     assert plots.save(fit_plot([looping], joint), tmp_path / "fit.png").stat().st_size > 20_000
+
+
+def test_of_a_joint_that_a_hand_guides_no_stiffness_is_stated():
+    """Noise in the columns takes a quarter off all parameters: the torque that damps tells nothing of their scale."""
+    _, record = joints.guided(*joints.polynomial(np.array([[[150.0, 1500.0]]])), 12000)
+    (found,) = fit(record, joints.joint_model(0.12, 0.8))
+    assert not found.excited and not found.parameters
+    assert abs(found.alpha[0] - 150.0) < 2.0 * np.sqrt(found.covariance[0, 0])

@@ -139,22 +139,8 @@ def test_an_unknown_spring_may_have_a_corner_and_be_bent_to_one_side(pull):
 def test_of_a_joint_that_a_hand_guides_the_interval_holds_what_noise_takes_off_the_scale():
     """The drive only damps: its torque follows from the motion, and all columns are the smaller the better they fit. It was
     a quarter too soft, and valid."""
-    rng = np.random.default_rng(0)
-    hz, phase = rng.uniform(0.2, 3.0, 8), rng.uniform(0.0, 2.0 * np.pi, 8)
-
-    def guided(t, _state, rate, _tau):
-        rate[:, 3] += 5.0 * np.sum(np.sin(2.0 * np.pi * hz * t + phase)) / np.sqrt(8.0) / 0.55
-
-    def damp(_k, state):
-        return -0.33 * state[:, 1:2]
-
-    plants = joints.Plants(*SPRINGS["polynomial"][:2], B, D, 0.55, 0.13, 0.02, more=guided)
-    truth = joints.simulate(plants, damp, T, size=(N, 1, 1))
-    how = {"motor_counts": 8192, "link_bits": 17, "velocity_rad_s": None}
-    noise = np.random.default_rng(5).normal(0, 0.0125, (N, 1))
-    out = joints.estimates(joints.joint_model(B, D), joints.record(truth, 0, T, **how, torque_noise=noise))[
-        4000:
-    ]
+    truth, record = joints.guided(*SPRINGS["polynomial"][:2], N)
+    out = joints.estimates(joints.joint_model(B, D), record)[4000:]
     off = np.abs(out[:, 3] - truth.sigma[4000:, 0, 0])
     assert np.mean(off < 2.0 * out[:, 4]) > 0.99
     assert np.median(out[:, 4]) > 0.05 * np.median(truth.sigma)  # no better than the declared inertia is

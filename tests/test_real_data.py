@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivelink import jointfile, recording
+from estimator import EstimatorSettings, Status, make_estimator
 from estimator.diagnosis import diagnose
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,3 +41,18 @@ def test_kuka_axes_have_friction_and_get_better_on_the_other_recording(axis, lim
     assert found.validation.after_relative < limit  # thirty lines of least squares: 23.7 % and 35.0 %
     assert found.validation.after_rms_nm < found.validation.before_rms_nm
     assert any("friction" in effect.name for effect in found.effects)
+
+
+@pytest.mark.parametrize(("name", "least"), [("A", 0.2), ("B", 0.4)])
+def test_kuka_axis_3_is_valid_on_line_with_nothing_but_its_inertia(name, least):
+    """The arm's weight keeps its deflection on one side; a constant spring's zero there is a constant torque."""
+    declared = jointfile.load(ROOT / "examples" / "kuka_axis3.toml")
+    record = recording.read(DATA / "kuka_kr300" / f"axis3_{name}.csv", declared)
+    estimator = make_estimator(declared.model(), EstimatorSettings(), record.period_s)
+    out = [estimator.step(sample) for sample in record.samples()]
+    valid = [one for one in out if one.status & Status.VALID]
+    assert len(valid) > least * len(out)
+    held = [
+        abs(one.stiffness_nm_rad - 4.10e6) < 2.0 * one.stiffness_std_nm_rad for one in valid
+    ]  # its authors'
+    assert sum(held) > 0.9 * len(valid)

@@ -97,7 +97,7 @@ def test_a_wrong_inertia_is_not_called_imprecise(quadratic):
         replace(m, inertia_kg_m2=8.0 * m.inertia_kg_m2, inertia_std_relative=0.01) for m in model.motors
     ]
     rows = replayed(quadratic.samples, EstimatorSettings(), replace(model, motors=tuple(motors)))
-    assert {why[0] for _, why, _ in rows[2000:] if why} & {"motor", "unexplained", "changed"}
+    assert {why[0] for _, why, _ in rows[2000:] if why} & {"unexplained", "changed"}
 
 
 def test_the_services_bits_have_their_reasons(quadratic):

@@ -23,6 +23,7 @@ from estimator.sample import SIGMA_95, FloatArray
 __all__ = ["design_effects", "hac_covariance"]
 
 
+_TIMES = ("torque_delay", "encoder_delay", "deflection_offset")  # of channels: they multiply nothing
 _FULL = 1e-9  # leverage is below one by the priors; guards a division against rounding
 
 Labels = NDArray[np.int64]
@@ -44,7 +45,36 @@ def hac_covariance(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> Fl
     wider = student.ppf(NormalDist().cdf(SIGMA_95), freedom) / SIGMA_95
     unit = _unit(fitted, free) * wider
     out[np.ix_(free, free)] = moderated * np.outer(unit, unit)
-    return out
+    return out + sum(_attenuated(problem, fitted, i) for i in range(len(problem.model.motors)))
+
+
+def _attenuated(problem: Problem, fitted: Fitted, motor: int) -> FloatArray:
+    """(k, k) what noise in the positions takes off all that multiplies them, squared.
+
+    Errors in variables (Fuller, Measurement Error Models, 1987): its power over what tells of the scale of a
+    motor's parameters, by that of its inertia. It is nothing where the motor drives the motion.
+    """
+    slots, nothing = fitted.slots, np.zeros_like(fitted.posterior.covariance)
+    own = [(s.kind, s.name, s.motor) for s in slots]
+    if ("everyday", "motor_inertia", motor) not in own:
+        return nothing
+    at, declared = own.index(("everyday", "motor_inertia", motor)), problem.model.motors[motor]
+    scale = np.array([s.taken for s in slots]) + fitted.posterior.x
+    scale[[s.motor != motor or s.kind == "shape" or s.name in _TIMES for s in slots]] = 0.0
+    scale[at] += declared.inertia_kg_m2
+    if ("everyday", "viscous_damping", motor) in own:
+        scale[own.index(("everyday", "viscous_damping", motor))] += declared.viscous_damping_nm_s_rad
+    law = fitted.base.models(problem.frames[0])[motor]
+    if law is not None and law.linear is not None:
+        scale[[s.kind == "base" and s.place >= law.linear for s in slots]] = 0.0
+    told = 0.0
+    for run, frame in enumerate(problem.at(fitted.corrections, fitted.base)):
+        group = run * problem.equations + motor
+        noise = frame.signals.row_noise(motor, float(scale[at]), frame.motors[motor].stiffness)
+        rows = np.count_nonzero(problem.group == group)
+        told += rows * noise / float(fitted.times[group] * fitted.posterior.sigma[group] ** 2)
+    share = min(told * float(fitted.posterior.covariance[at, at]) / max(float(scale[at] ** 2), 1e-300), 1.0)
+    return share**2 * np.outer(scale, scale)
 
 
 def design_effects(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> FloatArray:

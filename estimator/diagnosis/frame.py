@@ -165,6 +165,16 @@ class Signals:
         response = 2.0 * np.pi * frequency * light_response(self)
         return float(np.sqrt(self.noise(self.theta[motor], response)))
 
+    def row_noise(self, motor: int, inertia: float, stiffness: FloatArray) -> float:
+        """Return the variance of a row of a motor's balance by the noise of its positions, (N·m)²."""
+        frequency = self.light.frequency_hz
+        response = light_response(self) * lowpass(frequency, self.bandwidth_hz)
+        accelerated = inertia**2 * self.noise(self.theta[motor], (2.0 * np.pi * frequency) ** 2 * response)
+        if self.q is None:
+            return accelerated
+        read = self.noise(self.theta[motor], response) + self.noise(self.q, response)
+        return accelerated + float(np.mean(stiffness**2)) * read
+
 
 def _lag(frequency_hz: FloatArray, time_constant_s: float) -> NDArray[Any]:
     """1 / (1 + s T), or its inverse where T is negative."""

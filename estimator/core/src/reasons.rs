@@ -21,8 +21,6 @@ pub enum Reason {
     TorqueImprecise(f64),
     /// The stiffness is not above zero.
     NotPositive,
-    /// The balance fits no motor of the declared inertia and damping.
-    Motor,
     /// The rms share of the balance that the curve leaves, above what is of use.
     Unexplained(f64),
     /// The deflection is beyond any that was learned from.
@@ -45,7 +43,6 @@ impl Reason {
             Reason::Imprecise(_) => "imprecise",
             Reason::TorqueImprecise(_) => "torque_imprecise",
             Reason::NotPositive => "not_positive",
-            Reason::Motor => "motor",
             Reason::Unexplained(_) => "unexplained",
             Reason::Beyond => "beyond",
             Reason::Changed => "changed",

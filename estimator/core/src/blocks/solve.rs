@@ -303,8 +303,9 @@ impl Blocks {
     /// Whether a zero that has moved by so much can be told from another curve: one whose law is open only where
     /// deflections reach as far beyond it to either side.
     fn is_seen(&self, moved: f64) -> bool {
-        let [low, high] = self.seen;
-        !self.spring.law.is_polynomial() || self.spring.is_anchored() || 2.0 * moved.abs() < high.min(-low)
+        let ([low, high], spring) = (self.seen, &self.spring);
+        let open = spring.law.is_polynomial() && !spring.is_constant() && !spring.is_anchored();
+        !open || 2.0 * moved.abs() < high.min(-low)
     }
 
     /// What the groups that were not chosen, or a zero elsewhere, may change: the covariance between models, by their

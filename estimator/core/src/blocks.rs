@@ -1,6 +1,7 @@
 //! What one motor's balance has taught: blocks of rows, and the algebra on their sum.
 
 mod changes;
+mod interval;
 mod readout;
 mod solve;
 

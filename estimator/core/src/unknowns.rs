@@ -1,6 +1,7 @@
 //! The unknowns of a motor's balance: what each adds to a row, what is believed of it before any data, and what
 //! torque and stiffness they make at a deflection.
 
+mod prior;
 mod reading;
 
 use serde::{Deserialize, Serialize};
@@ -8,10 +9,9 @@ use serde::{Deserialize, Serialize};
 pub use reading::Reading;
 
 use crate::balance::{self};
-use crate::gram::{COLUMNS, Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, Vector, inverse, set};
+use crate::gram::{COLUMNS, Frame, Gram, Matrix, Posterior, Row, Set, UNKNOWNS, Vector, set};
 use crate::laws::{Alpha, Law, PARAMETERS};
 use crate::model::{Motor, Transmission};
-use crate::settings::Priors;
 use crate::spring::{Coefficients, Projection, TERMS};
 
 /// B, kg·m².
@@ -344,62 +344,6 @@ impl Spring {
     #[must_use]
     pub fn slope(&self, projection: &Projection) -> Coefficients {
         projection.of(|phi| self.curve(phi).1)
-    }
-
-    /// What is believed of the unknowns before any data, in the scale of these rows.
-    ///
-    /// `total`: rows that say how large the torque and the columns are.
-    #[must_use]
-    pub fn prior(&self, motor: &Motor, priors: &Priors, total: &Gram, frame: &Frame, scale: &Scale) -> Prior {
-        let Scale { zero_std, deflection, period_s } = *scale;
-        let torque = balance::variance(total, balance::TORQUE).max(f64::MIN_POSITIVE).sqrt();
-        let rms =
-            |unknown: usize| (total.quadratic(&frame.directions[unknown]) / total.rows).sqrt().max(1e-12);
-        let fluctuation = |unknown: usize| {
-            let mean = total.times(&frame.directions[unknown])[balance::OFFSET] / total.rows;
-            (rms(unknown).powi(2) - mean * mean).max(0.0).sqrt().max(1e-12)
-        };
-        let (mut mean, mut std) = ([0.0; UNKNOWNS], [1.0; UNKNOWNS]);
-        for unknown in SOFT..UNKNOWNS {
-            let gear = LOAD.contains(&unknown);
-            let share = if gear { priors.load_dependent_friction } else { priors.undeclared };
-            std[unknown] = share * torque / rms(unknown);
-        }
-        if self.series {
-            std[CORNER.start] = priors.spring * torque / rms(CORNER.start);
-        }
-        let inertia = motor.inertia_std.unwrap_or(priors.motor_inertia);
-        (mean[INERTIA], std[INERTIA]) = (motor.inertia, inertia * motor.inertia);
-        mean[DAMPING] = motor.damping;
-        std[DAMPING] = motor.damping_std.unwrap_or_else(|| {
-            priors.viscous_damping * motor.damping + priors.viscous_damping_floor * torque / rms(DAMPING)
-        });
-        std[OFFSET] = priors.torque_offset * torque;
-        std[DRY] = priors.coulomb_friction * torque;
-        let base = self.base();
-        let shapes = self.law.shapes();
-        for (i, unknown) in SPRING.enumerate().take(self.size) {
-            mean[unknown] = if self.anchored { self.start[i] - base[i] } else { 0.0 };
-            let undeclared = i >= if self.series { USUAL } else { self.least };
-            std[unknown] = match (self.anchored, i.checked_sub(1).and_then(|k| shapes.get(k))) {
-                _ if undeclared => priors.undeclared * torque / rms(unknown),
-                (true, Some(shape)) => priors.law * (self.start[i] - shape.low),
-                (true, None) if self.start[i] != 0.0 => priors.law * self.start[i].abs(),
-                (false, Some(shape)) => (2.0 * (self.alpha[i] - shape.low)).max(1.0 / deflection),
-                _ => priors.spring * torque / fluctuation(unknown), // its mean may be a zero that is elsewhere
-            };
-        }
-        (mean[ZERO], std[ZERO]) = (-self.zero, zero_std);
-        std[LATE] = priors.encoder_delay * period_s;
-        let mut prior = Prior::independent(mean, &std);
-        if let Some(covariance) = self.covariance.filter(|_| self.anchored) {
-            let known = set(SPRING.start..SPRING.start + self.least);
-            let precision = inverse(&covariance, known);
-            for i in SPRING.take(self.least) {
-                prior.precision[i] = precision[i];
-            }
-        }
-        prior
     }
 }
 

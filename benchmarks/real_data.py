@@ -175,8 +175,8 @@ def shaft_record(folder: Path, number: str) -> Record:
     )
 
 
-def diagnosed(run: Run, data: Path, out: Path) -> dict[str, Any]:
-    """Diagnose one machine and write its reports."""
+def diagnosed(run: Run, data: Path, out: Path | None) -> dict[str, Any]:
+    """Diagnose one machine; reports are of measured data and go where they are asked for."""
     joint = joint_of(run)
     if run.joint == "shaft_line":
         train, validation = (shaft_record(data, number) for number in (run.train, run.validation))
@@ -189,10 +189,11 @@ def diagnosed(run: Run, data: Path, out: Path) -> dict[str, Any]:
     if run.joint == "shaft_line":
         torque = shaft_sensor(data, run.validation)
         sensor = against_sensor(models["found"], validation, torque[: len(validation)])
-    folder = out / f"{run.joint}-{Path(run.train).stem}-{Path(run.validation).stem}"
-    folder.mkdir(parents=True, exist_ok=True)
-    title = report.Title(run.joint, Path(run.train).name, Path(run.validation).name)
-    write(folder, "report", document, report.html_page(outcome, title))
+    if out is not None:
+        folder = out / f"{run.joint}-{Path(run.train).stem}-{Path(run.validation).stem}"
+        folder.mkdir(parents=True, exist_ok=True)
+        title = report.Title(run.joint, Path(run.train).name, Path(run.validation).name)
+        write(folder, "report", document, report.html_page(outcome, title))
     return {
         **run._asdict(),
         "sensor": sensor,
@@ -254,6 +255,6 @@ if __name__ == "__main__":
         },
         scene.Option("--data", data, metavar="DIR"),
         scene.Option("--shaft-line", Path(shaft) if shaft else None, metavar="DIR"),
-        scene.Option("--out", Path("real_data"), "reports go there", metavar="DIR"),
+        scene.Option("--out", None, "reports go there", metavar="DIR"),
         after=ratios,
     )

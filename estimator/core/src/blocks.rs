@@ -40,6 +40,17 @@ struct Carried {
     unexplained: f64,
 }
 
+/// How noisy readings are.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+pub struct Readings {
+    /// Variance of a row that their white noise makes, (N·m)².
+    pub white: f64,
+    /// That of the positions' noise alone, which is in the columns, (N·m)².
+    pub positions: f64,
+    /// Resolution of the deflection, rad: rounding moves its zero by as much.
+    pub resolution: f64,
+}
+
 /// Blocks of one motor's rows.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Blocks {
@@ -83,12 +94,8 @@ pub struct Blocks {
     odds: Option<Odds>,
     /// Whether samples of late could not be used.
     pub spoilt: bool,
-    /// Variance of a row that the readings' white noise makes, (N·m)².
-    pub white: f64,
-    /// That of the positions' noise alone, which is in the columns, (N·m)².
-    pub rounding: f64,
-    /// Resolution of the deflection, rad: rounding moves its zero by as much.
-    pub resolution: f64,
+    /// How noisy the readings are.
+    pub readings: Readings,
     /// The least and the largest deflection since they are counted from where they are, rad.
     pub seen: [f64; 2],
     family: Family,
@@ -154,9 +161,7 @@ impl Blocks {
             residual: [0.0; crate::gram::COLUMNS],
             odds: None,
             spoilt: false,
-            white: 0.0,
-            rounding: 0.0,
-            resolution: 0.0,
+            readings: Readings::default(),
             seen: [0.0; 2],
             family: Family::of(Some(&spring.law)),
             located: false,
@@ -274,7 +279,7 @@ impl Blocks {
 
     /// Whether the latest rows are neither noise, nor as large as what explained blocks have held, nor uncertain.
     fn is_beyond(&self, row: &Row) -> bool {
-        let usual = self.quick_limit * self.white.max(self.own * self.own);
+        let usual = self.quick_limit * self.readings.white.max(self.own * self.own);
         if self.quick <= usual {
             return false;
         }
@@ -321,7 +326,7 @@ impl Blocks {
     fn believe(&mut self, block: &Gram) {
         let Some(projection) = self.projection.clone() else { return };
         let frame = self.spring.frame(&projection);
-        let near = self.priors.deflection_offset * self.deflection + self.resolution;
+        let near = self.priors.deflection_offset * self.deflection + self.readings.resolution;
         let prior = self.prior(block, &frame, near);
         let known = frame.set & ACTIVE;
         let covariance = inverse(&prior.precision, known);

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::align::Inputs;
 use crate::balance::{Balance, correlated_rows};
-use crate::blocks::{Blocks, Closed};
+use crate::blocks::{Blocks, Closed, Readings};
 use crate::choices::{AHEAD_S, GROWN, REACHED, SAID_S, SETTLED, SURE};
 use crate::deflection::{AT_REST, DeflectionFilter, Motion, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
@@ -299,10 +299,13 @@ impl Side {
         self.unconfirmed_s -= self.period;
         let positions = noise[0] + noise[1];
         self.blocks.seen = self.balance.seen();
-        self.blocks.resolution = (12.0 * positions).sqrt();
-        self.blocks.rounding =
+        let in_columns =
             gains[0] * self.stiffness.powi(2) * positions + gains[2] * self.inertia.powi(2) * noise[0];
-        self.blocks.white = self.blocks.rounding + gains[0] * torque_noise;
+        self.blocks.readings = Readings {
+            white: in_columns + gains[0] * torque_noise,
+            positions: in_columns,
+            resolution: (12.0 * positions).sqrt(),
+        };
         let row = self.balance.row(link);
         let closed = self.blocks.add(&row)?;
         let doubted = self.doubtful;

@@ -59,7 +59,7 @@ impl Blocks {
         }
         (scale[ZERO], scale[LATE]) = (0.0, 0.0);
         let open = chosen.covariance[INERTIA][INERTIA] / chosen.x[INERTIA].powi(2);
-        let share = (self.rounding * rows / noise * open).min(1.0);
+        let share = (self.readings.positions * rows / noise * open).min(1.0);
         let mut out = [[0.0; UNKNOWNS]; UNKNOWNS];
         for i in unknowns(chosen.set) {
             unknowns(chosen.set).for_each(|j| out[i][j] = share * share * scale[i] * scale[j]);
@@ -81,8 +81,8 @@ impl Blocks {
         // What no noise explains is an effect that is missing: what it does to a block is in the blocks' scores, what it
         // does to all of them alike is not. Nor is rounding, where the readings have too little noise to spread it.
         let (rounded, unlike) = (EXACT * EXACT * self.fluctuation, UNLIKE * self.friction);
-        let bare = (rounded - self.white).max(0.0);
-        let missing = (own - self.white - rounded).max(0.0) + bare + unlike * unlike;
+        let bare = (rounded - self.readings.white).max(0.0);
+        let missing = (own - self.readings.white - rounded).max(0.0) + bare + unlike * unlike;
         let by_prior = by_prior(chosen, prior);
         let blocks = self.ring.len() as f64;
         let clustered =

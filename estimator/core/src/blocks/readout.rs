@@ -58,7 +58,7 @@ impl Blocks {
     /// Whether the balance leaves less than a useful estimate may, and about what it left before a change.
     #[must_use]
     pub fn is_explained(&self) -> bool {
-        let usual = self.usual_unexplained().max((self.white / self.fluctuation).sqrt());
+        let usual = self.usual_unexplained().max((self.readings.white / self.fluctuation).sqrt());
         self.unexplained < USEFUL && self.unexplained <= UNUSUAL.sqrt() * usual
     }
 

@@ -164,7 +164,7 @@ impl Blocks {
         }
         self.fit_projection();
         let Some(projection) = self.projection.clone() else { return };
-        let near = self.priors.deflection_offset * self.deflection + self.resolution;
+        let near = self.priors.deflection_offset * self.deflection + self.readings.resolution;
         let zero = if self.lost { self.deflection } else { near };
         for step in 0..STEPS {
             let frame = self.spring.frame(&projection);

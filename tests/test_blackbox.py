@@ -94,6 +94,21 @@ def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(tmp_path, caplo
     assert "the estimator begins anew: snapshot: expected one of version" in caplog.text
 
 
+def test_a_state_that_is_read_before_the_first_model_is_of_it_and_not_of_the_next_one(tmp_path):
+    scene = Scene(tmp_path)
+    scene.box.snapshot(b"first")
+    scene.run(1)
+    scene.box.document("model", b"{}", 1)
+    scene.run(20)
+    scene.box.keep("asked")
+    scene.run(200)
+    scene.box.document("model", b'{"joint": "elbow"}', 2)
+    scene.run(20)
+    scene.box.keep("asked", asked=True)
+    states = {read_attachment(path, SNAPSHOT) for path, _ in scene.finish()}
+    assert states == {b"first", None}
+
+
 def test_memory_holds_no_more_than_is_kept_and_ten_alarms_a_minute_make_one_recording(tmp_path):
     scene = Scene(tmp_path)
     scene.run(2000)

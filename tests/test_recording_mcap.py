@@ -172,6 +172,27 @@ def test_a_cycle_that_was_carried_on_is_a_cycle_without_sample(tmp_path):
     assert cycles[120].flags == Status.BUS_FAULT and cycles[200].flags == Status.DRIVE_FAULT
 
 
+@pytest.mark.parametrize("batch", [1, 50, 1000])
+def test_batches_of_any_length_and_another_run_of_the_daemon_are_cycles_with_their_flags(batch, tmp_path):
+    path = tmp_path / "r.mcap"
+    sink = open_sink(path, JOINT)
+    runs = (2500, 1200)
+    for begin in range(
+        0, sum(runs), batch
+    ):  # all samples that wait, then all estimates, as a recorder takes them
+        waiting = [
+            (k if k < runs[0] else k - runs[0], k) for k in range(begin, min(begin + batch, sum(runs)))
+        ]
+        for sequence, k in waiting:
+            sink.sample(sample(sequence), BEGIN_NS + k)
+        for sequence, k in waiting:
+            sink.estimate(estimate(sequence, 3 | int(Status.DRIVE_FAULT) * (k % 70 == 0)))
+    sink.close()
+    cycles = list(recorded_cycles(path, 1))
+    assert [c.sequence for c in cycles] == [*range(runs[0]), *range(runs[1])]
+    assert [k for k, c in enumerate(cycles) if c.flags] == list(range(0, sum(runs), 70))
+
+
 def test_what_is_no_mcap_file_is_one_clear_line(tmp_path):
     (tmp_path / "x.mcap").write_bytes(b"something else entirely")
     record(tmp_path / "r.mcap", n=0)

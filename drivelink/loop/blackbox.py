@@ -74,7 +74,7 @@ class BlackBox(Sink):
         )
         self._mapping: tuple[dict[str, Any], int] | None = None
         self._model: tuple[str, bytes, int] | None = None
-        self._model_s = -math.inf  # when it came
+        self._model_s = -math.inf  # when it took the place of another
         self._holding: set[str] = set()  # causes of the last status document
         self._flags, self._contact = 0, False
         self._last_s: dict[str, float] = {}
@@ -113,7 +113,9 @@ class BlackBox(Sink):
         """Take a JSON document; a suspected signal, a fault or a lost bus in a status is an event."""
         self._take("document", name, payload, stamp_ns)
         if name == "model":
-            self._model, self._model_s = (name, payload, stamp_ns), self._clock()
+            if self._model is not None and self._model[1] != payload:
+                self._model_s = self._clock()
+            self._model = (name, payload, stamp_ns)
             self._reread()
             return
         status = json.loads(payload)

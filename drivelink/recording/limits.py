@@ -22,6 +22,7 @@ MAX_SAMPLES = 10_000_000  # periods from first to last sample of a recording in 
 MAX_COLUMNS = 4096  # columns of a CSV file; unknown ones are not kept in memory
 MAX_LINE_BYTES = 1 << 20  # of a line of text
 MAX_BLOCK_BYTES = 64 << 20  # an MCAP chunk or a BLF container, unpacked; tools write up to 8 MiB
+MAX_UNREAD = 30_000  # messages of one key that wait for a recorder: half a minute at 1 kHz
 _RECORD_BYTES = 3.5  # of a file for each record: a frame of a bus at rest takes 4 in MCAP, 4.8 in BLF
 _FEW_RECORDS = 5000  # that any file may have
 _LAST_STAMP_NS = (1 << 63) - 1  # of the year 2262

@@ -31,6 +31,7 @@ from drivelink.recording.columns import record_from_columns
 from drivelink.recording.cycles import Cycle
 from drivelink.recording.limits import (
     MAX_BLOCK_BYTES,
+    MAX_UNREAD,
     most_records,
     require_samples,
     require_stamp,
@@ -257,13 +258,15 @@ def _messages(
 
 _STALE = int(Status.STALE)
 _SERVICE = Status.having("replayed")
-_APART = 64  # largest distance in cycles between a sample and its estimate in the file
+_FEW = 128  # waiting cycles that are not worth a look for complete ones
+_Number = tuple[int, int]  # of a cycle: run of the daemon, sequence
 
 
 def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None = None) -> Iterator[Cycle]:
     """Yield the cycles of a recording in order.
 
-    A sample gets the flags of its estimate; a stale estimate is a cycle without sample.
+    A sample gets the flags of its estimate; a stale estimate is a cycle without sample. Both come in batches
+    that are as long as the recorder or the daemon had to wait for a processor.
 
     Args:
         scale: factors by column, as `[recording]` of the joint file gives them.
@@ -271,9 +274,11 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
     Raises:
         RecordingError: no samples in it.
     """
-    waiting: dict[int, Cycle] = {}
-    newest, found = -1, False
+    waiting: dict[_Number, Cycle] = {}
+    newest: dict[str, _Number] = {}  # by topic
+    most, found = _FEW, False
     for message in read_messages(path, frozenset({"sample", "estimate"})):
+        sample, flags = None, 0
         try:
             fields = message_fields(message.data)
             if message.topic.endswith("/sample"):
@@ -282,36 +287,33 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
                         fields[name] *= factor
                 if not found and f"motor{motors + 1}_position_rad" in fields:
                     raise RecordingError(f"{path}: has more motors than the joint file, which has {motors}")
-                sample = read_sample(fields, motors)
-                _require_number(sample.sequence)
-                found = True
-                before = waiting.get(sample.sequence)
-                cycle = Cycle(sample.sequence, message.log_time_ns, sample, before.flags if before else 0)
+                sample, found = read_sample(fields, motors), True
             else:
-                sequence, flags = int(fields["sequence"]), int(fields["status"]) & (_SERVICE | _STALE)
-                _require_number(sequence)
-                before = waiting.get(sequence)
-                cycle = Cycle(sequence, message.log_time_ns, before.sample if before else None, flags)
+                flags = int(fields["status"]) & (_SERVICE | _STALE)
+            sequence = int(fields["sequence"])
+            _require_number(sequence)
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             raise _strange(path, message.topic, error) from error
-        if cycle.sequence < newest - _APART:  # the daemon restarted: numbering begins again
-            yield from _released(waiting, newest + 1)
-            newest = -1
-        newest = max(newest, cycle.sequence)
-        waiting[cycle.sequence] = cycle
-        if len(waiting) > 2 * _APART:
-            yield from _released(waiting, newest - _APART)
-    yield from _released(waiting, newest + 1)
+        run, last = newest.get(message.topic, (0, -1))
+        number = (run + (sequence < last), sequence)  # another run: numbering began again
+        newest[message.topic] = number
+        if (before := waiting.get(number)) is not None:
+            sample, flags = sample or before.sample, flags | before.flags
+        waiting[number] = Cycle(sequence, message.log_time_ns, sample, flags)
+        if len(waiting) > most:
+            yield from _released(waiting, min(newest.values()) if len(newest) > 1 else (0, 0))
+            most = 2 * len(waiting) + _FEW
+    yield from _released(waiting, None)
     if not found:
         raise RecordingError(f"{path}: no samples in it (with raw frames in it: replay --frames)")
 
 
-def _released(waiting: dict[int, Cycle], until: int) -> Iterator[Cycle]:
-    """Yield the cycles before `until` in order; drop estimates without a recorded sample."""
-    for sequence in sorted(waiting):
-        if sequence >= until:
+def _released(waiting: dict[_Number, Cycle], until: _Number | None) -> Iterator[Cycle]:
+    """Yield the cycles before `until` (None: all), and more than may wait, in order; no estimates alone."""
+    for number in sorted(waiting):
+        if until is not None and number >= until and len(waiting) <= MAX_UNREAD:
             break
-        cycle = waiting.pop(sequence)
+        cycle = waiting.pop(number)
         if cycle.sample is not None or cycle.flags & _STALE:
             yield cycle._replace(flags=cycle.flags & _SERVICE)
 

@@ -27,14 +27,13 @@ from drivelink.jointfile import JointFile
 from drivelink.pubsub.feed import DECODERS, DaemonIdentity, follow_document, source_of
 from drivelink.recording.canlog import LoggedFrame
 from drivelink.recording.cycles import FrameSamples
-from drivelink.recording.limits import MAX_BLOCK_BYTES
+from drivelink.recording.limits import MAX_BLOCK_BYTES, MAX_UNREAD
 from drivelink.recording.mapping import layouts_from
 from drivelink.recording.sinks import Sink
 from estimator.sample import Sample
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_QUEUE = 30_000  # waiting messages per key: half a minute at 1 kHz
 _SNAPSHOTS = 2  # that wait: each has some megabytes
 _FLUSH_S = 1.0
 _POLL_S = 0.005
@@ -80,7 +79,7 @@ class ZenohTap:
         ring = zenoh.handlers.RingChannel
         handlers = {"sample": self._sample, "estimate": self._estimate, "external": self._external}
         self._streams: list[tuple[Any, Callable[[zenoh.Sample], None]]] = [
-            (session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)), handle)
+            (session.declare_subscriber(f"{key}/{name}", ring(MAX_UNREAD)), handle)
             for name, handle in handlers.items()
             if name in sink.wants
         ]

@@ -9,6 +9,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import time
 from datetime import UTC, datetime
 from pathlib import Path
@@ -150,6 +151,28 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path, monkeypatch, 
     assert [path.name for path in (tmp_path / "kept").iterdir()] == ["elbow.day.csv"]
 
 
+@pytest.mark.parametrize("full", [False, True])
+def test_keep_says_what_became_of_it(full, tmp_path, monkeypatch, capsys):
+    scene, status = Scene(tmp_path), []
+    if full:
+
+        def write(*_: object) -> int:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr("drivelink.recording.sinks.os.write", write)
+    asking = threading.Thread(target=lambda: status.append(cli.main(["keep", str(scene.path)])))
+    asking.start()
+    while asking.is_alive():
+        scene.run(8)
+        time.sleep(0.01)
+    out, err = capsys.readouterr()
+    made = [path for path, _ in scene.finish()]
+    if full:
+        assert status == [3] and not made and "No space left on device" in err
+    else:
+        assert status == [0] and out.splitlines()[-1] == f"{made[0]}: kept"
+
+
 def test_the_oldest_is_dropped_beyond_the_budget_and_nothing_else(tmp_path):
     names = [f"elbow-2026010{day}T000000Z-model-alarm.mcap" for day in (1, 2, 3)]
     others = ["elbow-2-20250101T000000Z-change.mcap", "elbow-best.mcap", "notes.txt"]
@@ -179,15 +202,18 @@ def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path):
         assert "ready" in drives.stdout.readline()
         with zenohkit.process("run", str(path), "--no-realtime", "--json") as daemon:
             assert "ready" in daemon.stdout.readline()
-            zenohkit.until((tmp_path / "kept").is_dir)
+            zenohkit.until((tmp_path / "kept" / "elbow.day.csv").exists)  # it works
             time.sleep(2.0)  # until the box has a state of the estimator
-            zenohkit.until(lambda: cli.main(["keep", str(path)]) == 0)
-            time.sleep(0.5)  # something to keep
-            assert not kept(tmp_path / "kept", "elbow")  # 14 s more are to come, but the daemon ends
-            daemon.send_signal(signal.SIGTERM)
-            _, err = daemon.communicate(timeout=60)
+            with zenohkit.process("keep", str(path), "--json") as asking:
+                zenohkit.until((tmp_path / "kept" / "elbow.keeping").exists)
+                time.sleep(0.5)  # something to keep
+                assert not kept(tmp_path / "kept", "elbow")  # 14 s more are to come, but the daemon ends
+                daemon.send_signal(signal.SIGTERM)
+                _, err = daemon.communicate(timeout=60)
+                said, _ = asking.communicate(timeout=60)
     assert daemon.returncode == 0 and "Traceback" not in err, err
     made = [one for one in (tmp_path / "kept").iterdir() if one.name.endswith("-asked.mcap")]
+    assert asking.returncode == 0 and json.loads(said)["recording"] == str(made[0])
     cycles = list(recorded_cycles(made[0], 2))
     assert len(cycles) > 100
     assert any(m.topic == "/elbow/can" for m in read_messages(made[0]))

@@ -9,13 +9,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
 
 from drivelink.errors import JointFileError, RecordingError
 from drivelink.jointfile import JointText, load_text
 from drivelink.loop.day import Day
-from drivelink.loop.finding import DOUBTS, UNFINISHED, drop_oldest, kept, recording_name, wish_of
+from drivelink.loop.finding import DOUBTS, UNFINISHED, drop_oldest, kept, recording_name, taken, wish_of
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.sinks import McapSink, Sink
 from estimator.sample import Sample, Status
@@ -84,6 +85,7 @@ class BlackBox(Sink):
             self._folder.mkdir(parents=True, exist_ok=True)
             for left in kept(self._folder, text.joint.name, UNFINISHED):  # by a kill
                 left.unlink()
+            taken(self._wish).unlink(missing_ok=True)
         except OSError as error:
             raise RecordingError(f"{self._folder}: cannot be written: {error.strerror}") from error
 
@@ -165,8 +167,9 @@ class BlackBox(Sink):
         """Begin to write what is complete, take a wish, add a row to the day; called once a second."""
         self._day.row()
         if self._wish.exists():
-            self._wish.unlink(missing_ok=True)
-            self.keep("asked", asked=True)
+            with suppress(OSError):  # taken back
+                self._wish.replace(taken(self._wish))
+                self.keep("asked", asked=True)
         busy = self._writer is not None and self._writer.is_alive()
         if self._event is not None and not busy and self._clock() >= self._event.at_s + AFTER_S:
             self._begin(self._event)
@@ -245,5 +248,17 @@ class BlackBox(Sink):
             if sink is not None:
                 sink.abandon()
                 unfinished.unlink(missing_ok=True)
+            self._answer(event, str(error))
             return
         _LOG.warning("%s: %s: kept in %s", self._text.joint.name, event.cause, path)
+        self._answer(event, path.name)
+
+    def _answer(self, event: _Event, text: str) -> None:
+        """Tell who asked, if anybody did, what became of it."""
+        if "asked" not in event.causes:
+            return
+        try:
+            with taken(self._wish).open("r+b") as file:
+                file.write(text.encode())
+        except OSError:  # the file is gone, or there is no room even for that
+            taken(self._wish).unlink(missing_ok=True)

@@ -88,12 +88,20 @@ def folder_of(text: JointText) -> Path:
 
 
 def wish_of(text: JointText) -> Path:
-    """Return the file that asks the black box of a joint to keep the last minute; it removes it.
+    """Return the file that asks the black box of a joint to keep the last minute; it renames it to `taken`.
 
     Raises:
         RecordingError: the joint file declares no folder.
     """
     return folder_of(text) / f"{text.joint.name}.keep"
+
+
+def taken(wish: Path) -> Path:
+    """Return the file of the last wish that was taken, into which the box writes what became of it.
+
+    That is the recording's name, or why there is none. Blanks fill it before: even a full disk has that room.
+    """
+    return wish.with_suffix(".keeping")
 
 
 def drop_oldest(folder: Path, joint: str, keep_mib: float) -> None:

@@ -20,10 +20,11 @@ pytest.importorskip("distributed", reason="the extra [fleet] is not installed")
 from drivelink import __version__, recording
 from drivelink.cli import main
 from drivelink.errors import RecordingError
-from drivelink.fleet import storage, task
+from drivelink.fleet import analysis, storage, task
 from drivelink.fleet.joints import Joints
 from drivelink.fleet.storage import FleetError, Source, Store
 from drivelink.fleet.table import FleetTable, read_rows
+from estimator.identify import identify
 
 
 @pytest.fixture
@@ -65,6 +66,7 @@ def test_a_row_says_what_fit_and_diagnose_say(fleet, joints, tmp_path):
     ("name", "text", "said"),
     [
         ("elbow-a.csv", "time_s,motor1_position_rad\n0,zero\n", "expected"),
+        ("elbow-a.csv", "time_s,motor1_position_rad\n", "expected samples below the header"),
         ("elbow-b.mcap", "no MCAP", "expected an MCAP file"),
         ("knee.csv", "time_s\n", "expected the name of a joint in the file's name or folder (elbow, wrist)"),
         ("elbow-wrist.csv", "time_s\n", "its name fits several joints: elbow, wrist"),
@@ -93,6 +95,14 @@ def test_units_and_signs_are_checked_before_anything_else(fleet, joints, tmp_pat
     assert (outcome.kind, outcome.rows[0]["validated_on"]) == ("done", task.HELD_OUT)
     asked = task.Task(source=source(fleet / "recordings" / "elbow-2026-01-05.csv"), version="0.0.0")
     assert "expected drivelink 0.0.0 on worker" in task.process(asked, joints).rows[0]["error"]
+
+
+def test_damping_is_as_uncertain_as_a_late_link_encoder_would_look_like(fleet, joints):
+    record = recording.read(fleet / "recordings" / "elbow-2026-01-05.csv")
+    (fitted,) = identify(record, joints.by_name["elbow"].file.model()).fits
+    on_time, late = (analysis._row(1, replace(fitted, link_delay_s=delay)) for delay in (0.0, 4e-3))
+    assert on_time["viscous_damping_std_nm_s_rad"] == pytest.approx(fitted.nuisance_std["damping"])
+    assert late["viscous_damping_std_nm_s_rad"] > 4e-3 * late["stiffness_middle_nm_rad"]
 
 
 @pytest.mark.slow

@@ -72,6 +72,16 @@ def test_nights_that_resemble_each_other_are_not_taken_for_a_trend():
     assert np.mean(np.array(p) < 0.05) < 0.08  # binomial, 500 draws: three sigma above 5 %
 
 
+def test_recordings_of_little_use_hide_neither_a_step_nor_a_ramp():
+    step = np.array([232.1, 221.9, 213.3, 231.9, 232.1, 208.8, 226.2, 208.9, 208.8, 208.6])
+    half = np.array([0.07, 7.7, 23.0, 0.4, 0.06, 0.07, 120.0, 0.08, 0.07, 1.4])
+    assert series_test(TIME_S[:10], step, half / 1.96).p_value < 1e-4
+    ramp = 0.65 + 0.055 * np.arange(10) + 0.003 * np.random.default_rng(9).standard_normal(10)
+    ramp[3] += 0.8
+    std = np.where(np.arange(10) == 3, 0.27, 0.002)
+    assert series_test(TIME_S[:10], ramp, std).p_value < 1e-4
+
+
 def test_too_few_recordings_none_that_scatter_and_some_of_one_moment():
     few, rising = LEAST - 1, np.linspace(1.0, 1.2, NIGHTS)
     assert series_test(TIME_S[:few], rising[:few], STATED[:few]).p_value == 1.0

@@ -68,6 +68,8 @@ def test_from_recordings_to_a_page(fleet, tmp_path, capsys):
     for r in rows:
         assert r["status"] == "error" or (out / r["report"]).exists()
         assert r["report"] is None or r["report"] in page
+    assert run_fleet(fleet, tmp_path / "none", "--since", "2027-01-01", recordings=recordings) == 0
+    assert capsys.readouterr().out == "4 recordings: 0 done, 4 too early\n"
     # earlier ones are left out; once more nothing is done, nothing is lost
     assert run_fleet(fleet, out, "--since", "2026-01-06", recordings=recordings) == 0
     assert "too early" in capsys.readouterr().out

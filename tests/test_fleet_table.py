@@ -86,9 +86,17 @@ def night(joint: str, k: int, stiffness: float, effects: list[str]) -> dict[str,
         "verdict": "effect" if effects else "sufficient", "sentence": "said", "excited": True,
         "parameters": json.dumps({"k_nm_rad": stiffness}), "covariance": [0.01], "deflection_middle_rad": 0.02,
         "stiffness_middle_nm_rad": stiffness, "stiffness_std_middle_nm_rad": 0.1, "report": f"{joint}{k}.html",
-        "error_before_relative": 0.1, "error_after_relative": 0.02, "viscous_damping_nm_s_rad": 0.8, "recording": f"{joint}-{k}.csv",
+        "error_before_relative": 0.1, "error_after_relative": 0.02, "recording": f"{joint}-{k}.csv",
         "time": datetime(2026, 1, 5, tzinfo=UTC) + timedelta(days=k),
+        "inertia_kg_m2": 0.2, "inertia_std_kg_m2": 0.001, "viscous_damping_nm_s_rad": 0.8, "viscous_damping_std_nm_s_rad": 0.01,
+        "deflection_offset_rad": 0.001, "deflection_offset_std_rad": 1e-5,
     }  # fmt: skip
+
+
+def sentence(*rows: dict[str, Any]) -> str:
+    """What the page says of a joint."""
+    (joint,) = summarise([*rows], 0.05)["joints"]
+    return str(joint["sentence"])
 
 
 def test_joints_come_by_urgency_with_what_changed_since_when():
@@ -112,6 +120,68 @@ def test_joints_come_by_urgency_with_what_changed_since_when():
     (effect,) = joints["rubs"]["effects"]
     assert (effect["significant"], effect["since"][:10]) == (True, "2026-01-14")
     assert joints["rubs"]["sentence"] == "New at the motor since 2026-01-14: Coulomb friction."
+
+
+@pytest.mark.parametrize(
+    ("inertia", "std", "effects", "said"),
+    [
+        (0.2, 0.001, [], "Stiffness stepped by +5."),
+        (0.21, 0.001, [], "The torque's scale stepped by +5."),
+        (0.2, 0.01, [], "Stiffness or the torque's scale stepped by +5."),
+        (0.2, 0.001, ["backlash@transmission"], "Stiffness or backlash stepped by +5."),
+    ],
+)
+def test_a_stiffness_that_changes_with_the_inertia_is_the_torque_and_beside_backlash_perhaps_no_spring(
+    inertia, std, effects, said
+):
+    rng, rows = np.random.default_rng(3), []
+    for k in range(10):
+        rows.append(night("elbow", k, (158.0 if k >= 4 else 150.0) + 0.1 * rng.standard_normal(), effects))
+        rows[-1] |= {"inertia_kg_m2": (inertia if k >= 4 else 0.2) + 1e-4 * rng.standard_normal()}
+        rows[-1] |= {"inertia_std_kg_m2": std}
+    assert said in sentence(*rows)
+
+
+@pytest.mark.parametrize("probability", [0.5, 1.0])
+def test_damping_zero_and_parameters_of_sure_effects_are_tested_for_changes_and_drawn(probability):
+    rng, rows = np.random.default_rng(4), []
+    for k in range(10):
+        effect = {
+            "name": "backlash",
+            "parameters": {"half_gap_rad": 0.001 * (1 + k) + 1e-5 * rng.standard_normal()},
+        }
+        effect |= {"std": {"half_gap_rad": 1e-5}, "probability": probability}
+        rows.append(night("elbow", k, 150.0 + 0.1 * rng.standard_normal(), ["backlash@transmission"]))
+        rows[-1] |= {
+            "viscous_damping_nm_s_rad": 0.8 + 0.08 * k + 0.001 * rng.standard_normal(),
+            "deflection_offset_rad": (0.013 if k >= 6 else 0.001) + 1e-5 * rng.standard_normal(),
+            "details": json.dumps({"effects": [effect]}),
+        }
+    rows.append(night("elbow", 10, 150.0, []) | {"excited": False, "deflection_offset_rad": 1.0})
+    said = sentence(*rows)
+    assert "Deflection offset stepped by +0.01199" in said and "rad on 2026-01-11." in said
+    assert "Viscous damping has drifted by +0.7" in said and "N·m·s/rad since 2026-01-0" in said
+    assert ("Backlash: half gap has drifted by +0.00" in said) == (probability == 1.0)
+    drawn = page(summarise(rows, 0.05))
+    assert drawn.count('class="when"') == (3 if probability == 1.0 else 2)
+
+
+def test_a_stiffness_that_says_nothing_at_the_common_deflection_is_no_point():
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
+    rows[4] |= {"covariance": [80.0**2]}
+    (joint,) = summarise(rows, 0.05)["joints"]
+    assert len(joint["transmissions"][0]["series"]) == 9
+    assert [one["reason"] for one in joint["unusable"]] == ["its motion does not reveal the stiffness"]
+
+
+def test_a_place_where_nothing_is_new_shows_all_that_is_found_there():
+    rows = [
+        night("elbow", k, 150.0, ["presliding_friction@motor"] + ["cogging@motor"] * (k > 7))
+        for k in range(10)
+    ]
+    (joint,) = summarise(rows, 0.05)["joints"]
+    (effect,) = joint["effects"]
+    assert (effect["names"], effect["recordings"]) == (["presliding_friction", "cogging"], 10)
 
 
 @pytest.mark.parametrize(("nights", "said"), [(5, "Too few recordings"), (6, "Steady.")])

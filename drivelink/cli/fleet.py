@@ -163,7 +163,8 @@ def _run(args: argparse.Namespace) -> int:
         print(f"and {said - _WARNINGS} lines more", file=sys.stderr)
     if not args.json:
         print(_summary(counts))
-    _report(args.out, as_json=args.json)
+    if args.json or counts.early < counts.found:
+        _report(args.out, as_json=args.json)
     return 0
 
 

@@ -94,7 +94,11 @@ def _row(number: int, one: TransmissionFit) -> dict[str, Any]:
         "torque_rms_nm": one.torque_rms_nm,
         "excited": one.excited,
         "inertia_kg_m2": one.inertia_kg_m2,
+        "inertia_std_kg_m2": one.nuisance_std["inertia"],
         "viscous_damping_nm_s_rad": one.viscous_damping_nm_s_rad,
+        "viscous_damping_std_nm_s_rad": one.nuisance_std["damping"],
+        "deflection_offset_rad": math.nan if rigid else one.deflection_offset_rad,
+        "deflection_offset_std_rad": one.nuisance_std["shift"],
         "fit_error_relative": math.nan if rigid else one.error_rms_nm / one.torque_rms_nm,
     }
     for name, share in NAMED.items() if one.excited else ():
@@ -103,6 +107,9 @@ def _row(number: int, one: TransmissionFit) -> dict[str, Any]:
         row[f"stiffness_{name}_nm_rad"], row[f"stiffness_std_{name}_nm_rad"] = _stiffness(
             one.model, one.alpha, one.covariance, phi
         )
+    if one.excited:  # a late reading of a spring's end looks like damping, and the motion seldom tells which
+        late = row["stiffness_middle_nm_rad"] * one.link_delay_s
+        row["viscous_damping_std_nm_s_rad"] = math.hypot(one.nuisance_std["damping"], late)
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
 
 

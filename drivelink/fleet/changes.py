@@ -5,11 +5,12 @@ before any recording, a ramp that begins at any recording, and two steps before 
 undoes a damage). Each is an F test in the regression weighted by the inverse variances (Chow 1960). The
 largest over all of a kind is the sup-F statistic (Andrews 1993; Bai and Perron 1998 for two steps);
 Bonferroni's inequality bounds its significance, one half of it for one change and one half for two. The bound
-holds for every n and needs no simulation. Variances are those that the estimates state, plus a variance
-between recordings estimated from successive differences (von Neumann 1941), which no step or ramp spoils. The
-scale is estimated from the residuals, so that only the ratios of the stated variances matter. Positive
-correlation between successive residuals reduces the number of independent ones (Bayley and Hammersley 1946).
-A change must stay significant whichever recording is left out: one odd recording is none.
+holds for every n and needs no simulation. Variances are those that the estimates state, plus the variance
+between recordings that makes the median of successive differences (von Neumann 1941) as large as they say:
+first ones, or second ones, which are small on a ramp. The scale is estimated from the residuals, so that only
+the ratios of the variances matter. Positive correlation between successive residuals reduces the number of
+independent ones (Bayley and Hammersley 1946). A change must stay significant whichever recording is left out:
+one odd recording is none.
 
 Appearance. Whether an effect is found more often after some recording than before: Fisher's exact test, the
 smallest p over all recordings, with the same bound.
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 from scipy.stats import hypergeom
 
+from drivelink.output.sentences import SURE
 from estimator.sample import FloatArray
 from estimator.transmissions import RIGID
 
@@ -38,6 +40,10 @@ _SEGMENT = 2  # recordings on either side of a step: one alone is an odd one
 _RAMP = 3  # recordings on a ramp: two are a step
 _CHI2_95 = 3.841  # of one degree of freedom: the interval of the place by the likelihood ratio
 _MOST = 4  # changes looked for in one series
+_FITTED = {  # parameters of every recording, and their standard deviations
+    "viscous_damping_nm_s_rad": "viscous_damping_std_nm_s_rad",
+    "deflection_offset_rad": "deflection_offset_std_rad",
+}
 _MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
 
 
@@ -58,6 +64,15 @@ class SeriesTest(NamedTuple):
 
     p_value: float
     scatter: float
+
+
+class Point(NamedTuple):
+    """An estimate, and the row of the table that it is of."""
+
+    row: dict[str, Any]
+    value: float
+    std: float | None
+    sure: bool = True  # of an effect that has this name for sure
 
 
 class Appearance(NamedTuple):
@@ -126,11 +141,14 @@ def changes(time_s: FloatArray, value: FloatArray, std: FloatArray, level: float
 
 
 def _weights(value: FloatArray, std: FloatArray) -> FloatArray:
-    """Inverse variances: as stated, plus what successive recordings differ by beyond that."""
+    """Inverse variances: as stated, plus what first or second differences have beyond that, if less."""
     stated = np.square(std)
-    typical = (_MAD * float(np.median(np.abs(np.diff(value))))) ** 2 / 2.0
-    between = max(typical - float(np.median(stated)), 0.0)
-    variance = stated + between
+    between = []
+    for order in ([1.0, -1.0], [1.0, -2.0, 1.0]):
+        beyond = np.square(_MAD * np.convolve(value, order, "valid"))
+        beyond -= np.convolve(stated, np.square(order), "valid")
+        between.append(float(np.median(beyond) / np.sum(np.square(order))))
+    variance = stated + max(min(between), 0.0)
     positive = variance[variance > 0.0]
     floor = float(np.median(positive)) if positive.size else 1.0
     return np.asarray(1.0 / np.maximum(variance, 1e-6 * floor))
@@ -273,8 +291,12 @@ def usable(row: dict[str, Any]) -> bool:
     )
 
 
-def unusable(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the recordings that show no stiffness of a transmission that has one, and why."""
+def unusable(rows: list[dict[str, Any]], shown: set[tuple[str, int]]) -> list[dict[str, Any]]:
+    """Return the recordings that show no stiffness of a transmission that has one, and why.
+
+    Args:
+        shown: report and transmission of those that do.
+    """
     return [
         {
             "time": iso(row["time"]),
@@ -284,7 +306,9 @@ def unusable(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             "report": row["report"] or "",
         }
         for row in rows
-        if row["time"] is not None and not usable(row) and row["model"] != RIGID
+        if row["time"] is not None
+        and (row["report"], row["transmission"]) not in shown
+        and row["model"] != RIGID
     ]
 
 
@@ -309,29 +333,22 @@ def lost(transmissions: list[dict[str, Any]], unusable: list[dict[str, Any]]) ->
     return list({row["recording"]: row for row in found}.values())
 
 
-def parameters(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the damping, and the parameters of the effects that were found, over the recordings."""
-    series: dict[tuple[str, int], list[dict[str, Any]]] = {}
-
-    def add(row: dict[str, Any], name: str, motor: int, value: Any, std: Any) -> None:
-        if isinstance(value, int | float) and row["time"] is not None:
-            known = std if isinstance(std, int | float) else None
-            point = {"time": iso(row["time"]), "value": value, "std": known, "report": row["report"]}
-            series.setdefault((name, motor), []).append(point)
-
+def parameters(rows: list[dict[str, Any]]) -> dict[tuple[str, int], list[Point]]:
+    """Return damping, zero and parameters of the effects found over the recordings, by name and motor."""
+    series: dict[tuple[str, int], list[Point]] = {}
     for row in rows:
         motor = int(row["transmission"])
-        add(row, "viscous_damping_nm_s_rad", motor, row["viscous_damping_nm_s_rad"], None)
-        effects = json.loads(row["details"] or "{}").get("effects", ()) if motor == 1 else ()
-        for effect in effects:
+        moves = row["excited"] or row["model"] == RIGID
+        found = {(name, motor): (row[name], row[std], True) for name, std in _FITTED.items() if moves}
+        for effect in json.loads(row["details"] or "{}").get("effects", ()) if motor == 1 else ():
             for name, value in effect["parameters"].items():
-                std = effect["std"].get(name)
-                add(row, f"{effect['name']}.{name}", effect.get("motor", 1), value, std)
-    return [
-        {"name": name, "motor": motor, "series": points}
-        for (name, motor), points in sorted(series.items())
-        if len(points) > 1
-    ]
+                key = f"{effect['name']}.{name}", effect.get("motor", 1)
+                found[key] = value, effect["std"].get(name), effect.get("probability", 1.0) >= SURE
+        for key, (value, std, sure) in found.items():
+            if isinstance(value, int | float) and row["time"] is not None:
+                known = std if isinstance(std, int | float) else None
+                series.setdefault(key, []).append(Point(row, value, known, sure))
+    return {key: points for key, points in sorted(series.items()) if len(points) > 1}
 
 
 def iso(moment: datetime | None) -> str | None:

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 from matplotlib.ticker import MaxNLocator
 
-from drivelink.fleet.summary import LOOK, STATES, spaced
+from drivelink.fleet.summary import LOOK, STATES, parameter_name, spaced
 from drivelink.output.document import Block, Document, Grid, Markup, Paragraph, Rows, Section, drawn
 from drivelink.output.document import page as draw
-from drivelink.output.numbers import Units, bare_name, in_words, number, with_interval
+from drivelink.output.numbers import Units, in_words, number, with_interval
 from estimator.sample import SIGMA_95
 
 _CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large
@@ -167,22 +167,20 @@ def _details(joint: dict[str, Any], order: str) -> str:
 def _small(joint: dict[str, Any], one: dict[str, Any]) -> str:
     """Chart of one other parameter over time."""
     series = [
-        {"time": p["time"], "stiffness_nm_rad": p["value"], "fitted_nm_rad": p["value"],
+        {"time": p["time"], "stiffness_nm_rad": p["value"], "fitted_nm_rad": p["fitted"],
          "std_nm_rad": p["std"] or 0.0, "report": p["report"], "verdict": ""}
         for p in one["series"]
     ]  # fmt: skip
-    effect, _, parameter = one["name"].rpartition(".")
-    unit = Units(False).of(parameter)
-    shown = {"transmission": one["motor"], "series": series, "changes": [], "unit": unit}
+    unit = Units(False).of(one["name"])
+    shown = {"series": series, "changes": one["changes"], "unit": unit}
     frame = _frame(joint, shown, _LEFT, 0.5 * _WIDTH - _LEFT - _RIGHT, 110.0)
-    body = _axes(frame, 132.0) + _points(shown, frame)
-    words = [in_words(effect)] if effect else []
-    words.append(bare_name(parameter) + (f", {unit}" if unit else ""))
+    body = _axes(frame, 132.0) + _bands(shown, frame) + _fitted(shown, frame) + _points(shown, frame)
+    words = [parameter_name(one["name"]), unit]
     if len(joint["transmissions"]) > 1:
         words.append(f"motor {one['motor']}")
     return (
         f'<figure><svg viewBox="0 0 {0.5 * _WIDTH:g} 132" role="img">{body}</svg>'
-        f"<figcaption>{html.escape(': '.join(words))}</figcaption></figure>"
+        f"<figcaption>{html.escape(', '.join(filter(None, words)))}</figcaption></figure>"
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from datetime import UTC, datetime
 from itertools import groupby
@@ -12,24 +11,10 @@ import numpy as np
 from scipy.stats import false_discovery_control
 
 from drivelink import __version__
-from drivelink.fleet.analysis import stiffness_at
-from drivelink.fleet.changes import (
-    LEAST,
-    Appearance,
-    SeriesChange,
-    SeriesTest,
-    appearance,
-    changes,
-    iso,
-    lost,
-    parameters,
-    series_test,
-    unusable,
-    usable,
-)
-from drivelink.output.numbers import in_words, with_interval
-from estimator.sample import SIGMA_95, FloatArray
-from estimator.transmissions import MODELS
+from drivelink.fleet.changes import LEAST, Appearance, appearance, iso, lost, unusable
+from drivelink.fleet.trends import Series, others, parameter, stiffnesses, transmission
+from drivelink.output.numbers import Units, bare_name, in_words, with_interval
+from estimator.sample import SIGMA_95
 
 SCHEMA = "drivelink.fleet/1"
 _METHOD = (
@@ -40,24 +25,12 @@ COLUMNS = [
     "joint", "transmission", "status", "error", "verdict", "sentence", "effects", "report",
     "model", "parameters", "covariance", "excited", "error_before_relative", "error_after_relative",
     "deflection_middle_rad", "stiffness_middle_nm_rad", "stiffness_std_middle_nm_rad",
-    "viscous_damping_nm_s_rad", "details",
+    "viscous_damping_nm_s_rad", "viscous_damping_std_nm_s_rad", "deflection_offset_rad",
+    "deflection_offset_std_rad", "inertia_kg_m2", "inertia_std_kg_m2", "details",
 ]  # fmt: skip
 
 _SHOWN = ("recording", "verdict", "effects", "sentence", "report")  # of a diagnosis
-_DAY_S = 86400.0
 _NO_PLACE = {"sufficient", "insufficient_excitation"}
-
-
-class _Series(NamedTuple):
-    """Stiffness of one transmission over its usable recordings."""
-
-    transmission: int
-    deflection_rad: float
-    rows: list[dict[str, Any]]
-    time_s: FloatArray
-    value: FloatArray
-    std: FloatArray
-    test: SeriesTest
 
 
 class _Place(NamedTuple):
@@ -65,8 +38,13 @@ class _Place(NamedTuple):
 
     place: str
     rows: list[dict[str, Any]]
-    names: list[str]
+    names: list[str]  # all, the most frequent first
+    best: list[str]  # those that the test is of
     test: Appearance
+
+    @property
+    def p_value(self) -> float | None:
+        return self.test.p_value
 
 
 def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[str, Any]:
@@ -82,21 +60,28 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
     rows = [row for row in rows if row["time"] is not None or row["status"] != "done"]
     ordered = sorted((row for row in rows if row["joint"]), key=lambda row: str(row["joint"]))
     joints = {name: list(group) for name, group in groupby(ordered, key=lambda row: str(row["joint"]))}
-    series = {name: _series(one) for name, one in joints.items()}
+    series = {name: stiffnesses(one) for name, one in joints.items()}
+    further = {name: others(one) for name, one in joints.items()}
     places = {name: _places(one) for name, one in joints.items()}
-    p = [s.test.p_value for name in joints for s in series[name]]
-    p += [place.test.p_value for name in joints for place in places[name]]
-    found = false_discovery_control(p).tolist() if p else []
-    level = false_discovery_rate * sum(q <= false_discovery_rate for q in found) / max(len(p), 1)
-    q = iter(found)
-    transmissions = {
-        name: [_transmission(s, next(q), false_discovery_rate, level) for s in series[name]]
-        for name in joints
-    }
-    effects = {
-        name: [_effect(place, next(q), false_discovery_rate) for place in places[name]] for name in joints
-    }
-    documents = [_joint(n, one, transmissions[n], effects[n]) for n, one in joints.items()]
+    every: list[Series | _Place] = [
+        s for of in (series, further, places) for ones in of.values() for s in ones
+    ]
+    tests = [(id(one), one.p_value) for one in every if one.p_value is not None]
+    found = false_discovery_control([p for _, p in tests]).tolist() if tests else []
+    level = false_discovery_rate * sum(q <= false_discovery_rate for q in found) / max(len(tests), 1)
+    q_of = dict(zip((key for key, _ in tests), found, strict=True))
+    # level at which changes are looked for; 0: the series does not change
+    levels = {id(one): level * (q_of.get(id(one), 1.0) <= false_discovery_rate) for one in every}
+    documents = [
+        _joint(
+            name,
+            one,
+            [transmission(s, q_of.get(id(s), 1.0), levels[id(s)]) for s in series[name]],
+            [parameter(s, q_of.get(id(s), 1.0), levels[id(s)]) for s in further[name]],
+            [_effect(place, q_of[id(place)], false_discovery_rate) for place in places[name]],
+        )
+        for name, one in joints.items()
+    ]
     documents.sort(key=lambda d: (-d["urgency"], d["joint"]))
     times = [row["time"] for row in rows if row["time"] is not None]
     broken = [row for row in rows if row["status"] != "done"]
@@ -106,7 +91,7 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "false_discovery_rate": false_discovery_rate,
         "method": _METHOD,
-        "tests": len(p),
+        "tests": len(tests),
         "level": level,
         "recordings": len({row["recording"] for row in rows}),
         "from": iso(min(times)) if times else None,
@@ -117,26 +102,6 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
             for row in broken
         ],
     }
-
-
-def _series(rows: list[dict[str, Any]]) -> list[_Series]:
-    made = []
-    able = [row for row in rows if usable(row)]
-    for number in sorted({int(row["transmission"]) for row in able}):
-        own = [row for row in able if row["transmission"] == number]
-        phi = float(np.median([row["deflection_middle_rad"] for row in own]))
-        values = np.array([_stiffness(row, phi) for row in own])
-        time_s = np.array([row["time"].timestamp() for row in own])
-        value, std = values[:, 0], values[:, 1]
-        made.append(_Series(number, phi, own, time_s, value, std, series_test(time_s, value, std)))
-    return made
-
-
-def _stiffness(row: dict[str, Any], phi: float) -> tuple[float, float]:
-    """Stiffness at the joint's common deflection; as recorded for an unknown model."""
-    if row["model"] not in MODELS:
-        return row["stiffness_middle_nm_rad"], row["stiffness_std_middle_nm_rad"]
-    return stiffness_at(row["model"], json.loads(row["parameters"]), row["covariance"], phi)
 
 
 def _places(rows: list[dict[str, Any]]) -> list[_Place]:
@@ -153,60 +118,17 @@ def _places(rows: list[dict[str, Any]]) -> list[_Place]:
         ]
         best = min(range(len(groups)), key=lambda k: tests[k].p_value)
         test = tests[best]._replace(p_value=min(1.0, tests[best].p_value * len(groups)))
-        shown = sorted(groups[best], key=lambda n: -found[n])
-        made.append(_Place(place, able, [n.partition("@")[0] for n in shown], test))
+        every, shown = (
+            [n.partition("@")[0] for n in sorted(group, key=lambda n: -found[n])]
+            for group in (groups[0], groups[best])
+        )
+        made.append(_Place(place, able, every, shown, test))
     return made
 
 
-def _transmission(series: _Series, q: float, rate: float, level: float) -> dict[str, Any]:
-    significant = q <= rate
-    found = changes(series.time_s, series.value, series.std, level) if significant else []
-    change = sum((one.shape for one in found), np.zeros(len(series.value)))
-    base = float(np.median(series.value - change))  # the level before any change
-    fitted = base + change
-    return {
-        "transmission": series.transmission,
-        "deflection_rad": series.deflection_rad,
-        "p_value": series.test.p_value,
-        "q_value": q,
-        "significant": significant,
-        "stiffness_nm_rad": float(fitted[-1]),
-        "scatter_relative": series.test.scatter / base,
-        "changes": [_changed(series, one, base) for one in found],
-        "series": [
-            {
-                "time": iso(row["time"]),
-                "stiffness_nm_rad": float(value),
-                "std_nm_rad": float(std),
-                "fitted_nm_rad": float(level_),
-                "verdict": row["verdict"],
-                "recording": row["recording"],
-                "report": row["report"],
-            }
-            for row, value, std, level_ in zip(series.rows, series.value, series.std, fitted, strict=True)
-        ],
-    }
-
-
-def _changed(series: _Series, change: SeriesChange, base: float) -> dict[str, Any]:
-    days = (series.time_s[-1] - series.time_s[change.first]) / _DAY_S
-    document = {
-        "kind": change.kind,
-        "since": iso(series.rows[change.first]["time"]),
-        "since_earliest": iso(series.rows[change.earliest]["time"]),
-        "since_latest": iso(series.rows[change.latest]["time"]),
-        "amount_nm_rad": change.amount,
-        "amount_std_nm_rad": change.amount_std,
-        "amount_relative": change.amount / base,
-        "amount_std_relative": change.amount_std / base,
-    }
-    if change.kind == "drift" and days > 0.0:
-        document["per_30_days_relative"] = change.amount / base / days * 30.0
-    return document
-
-
 def _effect(place: _Place, q: float, rate: float) -> dict[str, Any]:
-    names = set(place.names)
+    shown = place.best if q <= rate else place.names
+    names = set(shown)
     seen = [
         row
         for row in place.rows
@@ -217,7 +139,7 @@ def _effect(place: _Place, q: float, rate: float) -> dict[str, Any]:
     )
     return {
         "location": place.place,
-        "names": place.names,
+        "names": shown,
         "p_value": place.test.p_value,
         "q_value": q,
         "significant": q <= rate,
@@ -234,26 +156,31 @@ def _effect(place: _Place, q: float, rate: float) -> dict[str, Any]:
 
 
 def _joint(
-    name: str, rows: list[dict[str, Any]], transmissions: list[dict[str, Any]], effects: list[dict[str, Any]]
+    name: str,
+    rows: list[dict[str, Any]],
+    transmissions: list[dict[str, Any]],
+    others: list[dict[str, Any]],
+    effects: list[dict[str, Any]],
 ) -> dict[str, Any]:
     done = [row for row in rows if row["status"] == "done"]
     broken = [row for row in rows if row["status"] != "done"]
     last = done[-1] if done else None
-    without = unusable(rows)
+    shown = {(p["report"], t["transmission"]) for t in transmissions for p in t["series"]}
+    without = unusable(rows, shown)
     gone = lost(transmissions, without)
-    state, size = _state(transmissions, effects, last, gone)
+    state, size = _state(transmissions, others, effects, last, gone)
     return {
         "joint": name,
         "state": state,
         "urgency": STATES[state] + min(size, 0.999),
-        "sentence": _sentence(state, transmissions, effects, rows, gone),
+        "sentence": _sentence(state, transmissions, others, effects, rows, gone),
         "recordings": len({row["recording"] for row in rows}),
         "broken": len(broken),
         "last": iso(rows[-1]["time"]),
         "verdict": last["verdict"] if last else None,
         "transmissions": transmissions,
         "unusable": without,
-        "parameters": parameters(done),
+        "parameters": others,
         "effects": effects,
         "diagnoses": [
             {**{key: row[key] for key in _SHOWN}, "time": iso(row["time"])}
@@ -269,12 +196,14 @@ LOOK = ("changing", "lost", "finding", "unread")  # those that need a look
 
 def _state(
     transmissions: list[dict[str, Any]],
+    others: list[dict[str, Any]],
     effects: list[dict[str, Any]],
     last: dict[str, Any] | None,
     gone: list[dict[str, Any]],
 ) -> tuple[str, float]:
     """Urgency of a joint, and relative size of the change to sort by."""
     moved = [abs(c["amount_relative"]) for t in transmissions for c in t["changes"]]
+    moved += [c["share"] for one in others for c in one["changes"]]
     appeared = [
         abs(e["error_before_relative"] - e["error_after_relative"]) for e in effects if e["significant"]
     ]
@@ -294,20 +223,20 @@ def _state(
 def _sentence(
     state: str,
     transmissions: list[dict[str, Any]],
+    others: list[dict[str, Any]],
     effects: list[dict[str, Any]],
     rows: list[dict[str, Any]],
     gone: list[dict[str, Any]],
 ) -> str:
     """Summary of a joint in words."""
     said = []
-    several = len(transmissions) > 1
-    for one in transmissions:
-        of = f"Stiffness of motor {one['transmission']}" if several else "Stiffness"
+    several = any(row["transmission"] == 2 for row in rows)
+    for one in (*transmissions, *others):
         for change in one["changes"]:
-            amount, std = 100.0 * change["amount_relative"], 100.0 * change["amount_std_relative"]
-            much = f"{'+' * (amount > 0.0)}{with_interval(amount, SIGMA_95 * std)} %"
+            what, much = _moved(one, change)
+            of = f" of motor {one.get('transmission') or one['motor']}" if several else ""
             verb, since = ("stepped", "on") if change["kind"] == "step" else ("has drifted", "since")
-            said.append(f"{of} {verb} by {much} {since} {change['since'][:10]}.")
+            said.append(f"{what[0].upper()}{what[1:]}{of} {verb} by {much} {since} {change['since'][:10]}.")
     for effect in effects:
         if effect["significant"]:
             names = " or ".join(map(in_words, effect["names"][:2]))
@@ -332,6 +261,25 @@ def _sentence(
     if fewest < LEAST:
         return f"Too few recordings with a stiffness to judge a change: {fewest}, of {LEAST} or more."
     return "Steady."
+
+
+def _moved(one: dict[str, Any], change: dict[str, Any]) -> tuple[str, str]:
+    """Return what has changed, and by how much."""
+    if "causes" in change:
+        amount, half, unit = 100.0 * change["amount_relative"], 100.0 * change["amount_std_relative"], "%"
+        what = " or ".join(
+            "the torque's scale" if c == "torque_scale" else in_words(c) for c in change["causes"]
+        )
+    else:
+        amount, half, unit = change["amount"], change["amount_std"], Units(False).of(one["name"])
+        what = parameter_name(one["name"])
+    return what, f"{'+' * (amount > 0.0)}{with_interval(amount, SIGMA_95 * half, unit)}"
+
+
+def parameter_name(name: str) -> str:
+    """Return a parameter as a chart is titled: backlash: half gap."""
+    effect, _, parameter = name.rpartition(".")
+    return ": ".join(filter(None, (in_words(effect), bare_name(parameter))))
 
 
 def spaced(place: str) -> str:

@@ -237,7 +237,12 @@ def _results(
             at = piece.record.start_s + float(piece.record.sequence[0]) * piece.record.period_s
             begin = at if begin is None else begin
             part = f", part {piece.part} of {piece.parts}" if piece.parts > 1 else ""
-            title = Title(joint.name, task.source.name + part, None if validation is None else where)
+            title = Title(
+                joint.name,
+                task.source.name + part,
+                None if validation is None else where,
+                file.axis == "linear",
+            )
             remarks = gate(path, file, piece.record, strict=True)
             analysis = analyse(piece.record, file, validation, title, remarks)
             suffix = f"-{piece.part}" if piece.parts > 1 else ""
@@ -304,7 +309,7 @@ def recorded_time(path: Path, source: Source, joint: JointFile | None = None) ->
 def _first_time(path: Path, joint: JointFile | None) -> float:
     """`time_s` of the first row of a CSV; 0 if not found."""
     names = column_map(joint, None)
-    with suppress(DrivelinkError, KeyError, IndexError):
+    with suppress(DrivelinkError, KeyError, IndexError, StopIteration):
         return float(renamed(first_row(path, names), names, path.name)["time_s"][0])
     return 0.0
 

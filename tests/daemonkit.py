@@ -4,17 +4,14 @@ import itertools
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import can
-import pytest
 from can.interfaces import virtual
 from zenohkit import LIMIT_S, until
 
 from drivelink._core import Tick
-from drivelink.cycle.startup import join_bus
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint
@@ -157,11 +154,6 @@ def served(joint: JointFile) -> Iterator[Network]:
 def listens(joint: JointFile, devices: int) -> None:
     """Wait until one more than the simulated devices is on a virtual bus: from then on it misses no frame."""
     until(lambda: len(virtual.channels.get(joint.bus.channel, ())) > devices)
-
-
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A passive daemon waits longer for its master, which a loaded machine may not let begin in five seconds."""
-    monkeypatch.setattr("drivelink.daemon.service.join_bus", partial(join_bus, patience_s=60.0))
 
 
 @contextmanager

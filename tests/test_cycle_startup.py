@@ -15,7 +15,7 @@ from canopenkit import joint_text
 from drivelink._core import LATE
 from drivelink.cycle.startup import BusPort, join_bus
 from drivelink.cycle.syncclock import SyncClock, measure_period
-from drivelink.errors import DriveError
+from drivelink.errors import BusError
 from drivelink.jointfile import parse
 
 DRIVE = """counts_per_rev = 16384
@@ -50,24 +50,44 @@ def joined(period_s: float, bus: str):
 
 
 HEARD = "heard in 0.1 s: 2 SYNC, 1 heartbeats (pre-operational), no SDO requests to it, no PDOs of it"
+UNMAPPED = [(0x080, b""), (0x705, b"\x7f"), (0x080, b"")]
 
 
 @pytest.mark.parametrize(
-    ("drive", "said"),
+    ("drive", "first", "said"),
     [
-        (DRIVE, f"node 5: expected frame 0x185 on SYNC; {HEARD}: has its master mapped and started it?"),
-        (DRIVE.partition("[[")[0], f"or eds in the joint file; {HEARD}"),
+        (DRIVE, [], 'in 0.1 s: with bus.sync = "follow" another master must produce it'),
+        (
+            DRIVE,
+            UNMAPPED,
+            f"node 5: expected frame 0x185 on SYNC; {HEARD}: has its master mapped and started it?",
+        ),
+        (DRIVE.partition("[[")[0], UNMAPPED, f"or eds in the joint file; {HEARD}"),
     ],
 )
-def test_what_was_heard_of_a_node_that_its_master_has_not_mapped_yet_is_said(drive, said):
+def test_another_master_is_waited_for_and_what_is_missing_is_said_once(drive, first, said, caplog):
     joint = parse(joint_text(drive=drive, bus='configure = false\nsync = "follow"\n'))
     bus = Playing(0.001)
-    sent = [(0x080, b""), (0x705, b"\x7f"), (0x080, b"")]
-    messages = [can.Message(arbitration_id=one, data=data, is_extended_id=False) for one, data in sent]
-    bus._frames = itertools.chain(messages, itertools.repeat(None))
-    with pytest.raises(DriveError) as caught:
-        join_bus(BusPort(bus), [joint], [Path()], patience_s=0.1)
-    assert str(caught.value).endswith(said)
+
+    def late() -> Iterator[can.Message | None]:
+        yield from (can.Message(arbitration_id=one, data=data, is_extended_id=False) for one, data in first)
+        while said not in caplog.text:
+            yield None
+        for _ in range(1000):
+            yield None
+        if "[[" not in drive:
+            raise can.CanOperationError("enough")
+        yield from Playing(0.001)._frames
+
+    bus._frames = late()
+    if "[[" not in drive:  # nobody maps it
+        with pytest.raises(BusError, match="enough"):
+            join_bus(BusPort(bus), [joint], [Path()], patience_s=0.1)
+    else:
+        _, layouts = join_bus(BusPort(bus), [joint], [Path()], patience_s=0.1)
+        assert layouts[0][0].node_id == 5
+    (line,) = [one for one in caplog.messages if one.startswith("waiting for another master: ")]
+    assert said in line
 
 
 WRONG = (

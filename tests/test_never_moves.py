@@ -8,7 +8,7 @@ import time
 
 import pytest
 from can.interfaces.virtual import VirtualBus
-from daemonkit import Listener, listens, patient, rig, running, served, vsa, vsa_text
+from daemonkit import Listener, listens, rig, running, served, vsa, vsa_text
 from zenohkit import until
 
 from drivelink.cycle.sources import VirtualSource
@@ -87,7 +87,6 @@ def test_through_boot_run_reboot_and_configuration_no_frame_could_move_a_drive(p
 
 
 def test_a_passive_daemon_puts_no_frame_on_the_bus_whatever_happens(monkeypatch):
-    patient(monkeypatch)
     senders: list[tuple[object, int]] = []
     by_bus, by_source = VirtualBus.send, VirtualSource.send
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import can
@@ -18,7 +19,7 @@ from drivelink.canopen.layout import NodeLayout, roles
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.loop import CycleLoop
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
-from drivelink.errors import BusError, DriveError
+from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection, JointFile
 
 
@@ -45,7 +46,7 @@ Joined = tuple[Configurator | PassiveConfigurator, tuple[tuple[NodeLayout, ...],
 
 logger = logging.getLogger(__name__)
 
-_PATIENCE_S = 5.0  # timeout for another master's SYNC, and for the frames that answer it
+_PATIENCE_S = 5.0  # after which it is said what another master is waited for
 
 
 def join_bus(
@@ -58,12 +59,13 @@ def join_bus(
 ) -> Joined:
     """Get the layouts of all nodes, by configuring them or by listening.
 
-    The period of another master's SYNC is measured and returned in the configurator's `bus`; a different
-    period in the joint file is logged.
+    Another master, for its SYNC or its configuration of the nodes, is waited for without end; after
+    `patience_s` one line says so. The period of its SYNC is measured and returned in the configurator's
+    `bus`; a different period in the joint file is logged.
 
     Raises:
-        BusError: SYNC is missing or unexpected, or the bus fails.
-        DriveError: a node is absent, refuses, or its mapping is not known.
+        BusError: SYNC is unexpected, or the bus fails.
+        DriveError: a node is absent, refuses, or its frames are shorter than the joint file says.
     """
     section = joints[0].bus
     if section.configure:
@@ -114,18 +116,31 @@ def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[
             yield message.arbitration_id, bytes(message.data), int(message.timestamp * 1e9)
 
 
+def _patiently(
+    port: BusPort, idle: Idle | None, patience_s: float, lacking: Callable[[], str]
+) -> Iterator[tuple[int, bytes, int]]:
+    """The same without end; what is lacking after a while is said once."""
+    yield from _frames(port, idle, patience_s)
+    if text := lacking():
+        logger.warning("waiting for another master: %s", text)
+    yield from _frames(port, idle, math.inf)
+
+
 def _listen(port: BusPort, passive: PassiveConfigurator, idle: Idle | None, patience_s: float) -> None:
     """Listen until the mapping of every node is known."""
     if not passive.busy:
         return
     heard = _Heard()
-    for cob_id, data, _ in _frames(port, idle, patience_s):
+
+    def lacking() -> str:
+        node, missing = next(iter(passive.missing.items()))
+        return f"{missing}; {heard.of(node, patience_s)}"
+
+    for cob_id, data, _ in _patiently(port, idle, patience_s, lacking):
         heard.feed(cob_id, data)
         _overhear(passive, cob_id, data)
         if not passive.busy:
             return
-    node, missing = next(iter(passive.missing.items()))
-    raise DriveError(f"{missing}; {heard.of(node, patience_s)}")
 
 
 def _overhear(passive: PassiveConfigurator, cob_id: int, data: bytes) -> bool:
@@ -161,10 +176,14 @@ class _Heard:
 class _Expected:
     """Frames required before the loop runs: SYNC, and the answers of every node."""
 
-    def __init__(self, channel: str, layouts: Iterable[NodeLayout], synced: bool = False) -> None:
+    def __init__(self, channel: str, layouts: Iterable[NodeLayout]) -> None:
         self.channel = channel
-        self.synced = synced
+        self.synced = False
         self.heard = _Heard()
+        self.expect(layouts)
+
+    def expect(self, layouts: Iterable[NodeLayout]) -> None:
+        """Require the answers of nodes with these layouts from now on."""
         self._frames = {
             tpdo.cob_id: (layout.node_id, tpdo.length)
             for layout in layouts
@@ -188,14 +207,17 @@ class _Expected:
                     "its mapping is not what the joint file says"
                 )
 
-    def failure(self, patience_s: float) -> BusError | DriveError:
+    def lacking(self, patience_s: float) -> str:
+        """Return what has not come; empty: nothing."""
+        if self.met:
+            return ""
         if not self.synced:
-            return BusError(
+            return (
                 f'no SYNC on {self.channel} in {patience_s:g} s: with bus.sync = "follow" another master '
                 'must produce it; set bus.sync = "produce" if there is none'
             )
         cob_id, (node, _) = next(iter(self._frames.items()))
-        return DriveError(
+        return (
             f"node {node}: expected frame 0x{cob_id:03X} on SYNC; {self.heard.of(node, patience_s)}: "
             "has its master mapped and started it?"
         )
@@ -211,17 +233,16 @@ def _await(
     """Listen until all expected frames have come; follow mapping changes meanwhile.
 
     Returns:
-        Stamps of the SYNCs, if possible enough to measure their period.
+        Stamps of the last SYNCs, if possible enough to measure their period.
     """
-    stamps: list[int] = []
-    for cob_id, data, stamp_ns in _frames(port, idle, patience_s):
+    stamps: deque[int] = deque(maxlen=MEASURED_SYNCS)
+    end_s = time.monotonic() + patience_s
+    for cob_id, data, stamp_ns in _patiently(port, idle, patience_s, lambda: expected.lacking(patience_s)):
         if passive is not None and _overhear(passive, cob_id, data):
-            expected = _Expected(expected.channel, passive.layouts.values(), expected.synced)
+            expected.expect(passive.layouts.values())
         expected.feed(cob_id, data)
         if cob_id == SYNC_COB_ID:
             stamps.append(stamp_ns)
-        if expected.met and len(stamps) >= MEASURED_SYNCS:
-            return stamps
-    if not expected.met:
-        raise expected.failure(patience_s)
-    return stamps
+        if expected.met and (len(stamps) == MEASURED_SYNCS or time.monotonic() > end_s):
+            break
+    return list(stamps)

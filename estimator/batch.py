@@ -20,7 +20,8 @@ from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.findings import DELAYS, stamped_wrongly
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.heldout import Held, held_out
-from estimator.diagnosis.hypothesis import Fitted, Problem
+from estimator.diagnosis.hypothesis import Fitted
+from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
@@ -328,7 +329,7 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
     """Return the result of a fit for each motor and its transmission."""
     problem, fitted = joint.problem, joint.fitted
     frames = problem.at(fitted.corrections, fitted.base)
-    base = fitted.moved_base(problem)
+    base = fitted.moved_base(problem.frames[0])
     covariances = _spring_covariances(joint)
     pairs = zip(base.models(frames[0]), base.alpha, covariances, strict=True)
     return [_transmission_fit(joint, frames, i, *one) for i, one in enumerate(pairs)]

@@ -62,7 +62,7 @@ class World:
     def _more(self, inertia: FloatArray) -> joints.More | None:
         names = (
             "coulomb_nm offset_nm cogging_nm second_nm fading_nm bump_nm constant ripple link_nm push_nm "
-            "hysteresis_nm"
+            "hysteresis_nm stribeck_nm"
         )
         v = {name: self._value(name) for name in names.split()}
         width = self._value("hysteresis_rad", 1.0)
@@ -71,9 +71,9 @@ class World:
         def more(t: float, x: FloatArray, out: FloatArray, tau: FloatArray) -> None:
             theta, w, _, link_w, memory = x.T
             motor = link = np.zeros(len(x))
-            if on & {"coulomb_nm", "fading_nm"}:
-                sign = w / np.sqrt(w * w + 4e-6)
-                motor = motor - (v["coulomb_nm"] + v["fading_nm"] * np.exp(-t / 5.0)) * sign
+            if on & {"coulomb_nm", "stribeck_nm", "fading_nm"}:
+                level = v["coulomb_nm"] + v["stribeck_nm"] * np.exp(-((w / 0.05) ** 2))
+                motor = motor - (level + v["fading_nm"] * np.exp(-t / 5.0)) * w / np.sqrt(w * w + 4e-6)
             if on & {"offset_nm", "cogging_nm", "second_nm", "bump_nm"}:
                 motor = motor - v["offset_nm"] - v["cogging_nm"] * np.sin(17.0 * theta)
                 motor = motor - v["second_nm"] * np.sin(34.0 * theta)

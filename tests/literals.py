@@ -41,7 +41,7 @@ REASONS: dict[str, dict[str, str]] = {
         "0.0001": "likewise, of x",
     },
     "diagnosis/frame.py": {"0.45": "of the sampling rate: below half of it"},
-    "diagnosis/hypothesis.py": {
+    "diagnosis/problem.py": {
         "0.01": "quantile of the steps of a reading: one count",
         "0.7": "place of held-out blocks: not the middle of a period",
     },

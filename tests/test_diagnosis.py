@@ -43,6 +43,7 @@ OTHERS: dict[str, dict[str, float]] = {
     "clean": {}, "clean2": {}, "skew": {"late_s": 0.0007}, "bump": {"bump_nm": 1.0},
     "harmonics": {"cogging_nm": 0.5, "second_nm": 0.3},
     "two": {"coulomb_nm": 0.4, "gravity_nm": 0.8},
+    "stribeck": {"coulomb_nm": 0.4, "stribeck_nm": 0.4}, "gauge, little": {"gauge_late_s": 0.002},
 }  # fmt: skip
 SURFACES = {"push": {"push_nm": 2.0}, "fading": {"fading_nm": 0.8}, "ripple": {"ripple": 0.2}}
 
@@ -71,6 +72,19 @@ def test_an_injected_effect_is_named_located_and_measured(case, records):
     assert found.validation.after_rms_nm <= found.validation.before_rms_nm or at_noise
     assert first.probability > 0.9
     assert any("error after over before: " in note for note in found.notes)
+
+
+def test_friction_that_peaks_at_standstill_is_named_on_a_motion_that_rarely_stands_still(records):
+    friction, *more = diagnose(records["stribeck"], kit.model()).effects
+    assert not more and friction.name == "stribeck_friction" and friction.probability > 0.9
+    assert friction.parameters["torque_nm"] == pytest.approx(0.4, abs=0.02)
+    assert friction.parameters["stribeck_velocity_rad_s"] == pytest.approx(0.05, rel=0.3)  # the laws differ
+
+
+def test_a_small_delay_without_link_dynamics_may_be_another_effects(records):
+    (late,) = diagnose(records["gauge, little"], kit.model(linked=False)).effects
+    assert {"deflection_delay", "transmission_damping"} < {late.name, *late.alternatives}
+    assert late.probability < 0.9
 
 
 def test_two_ripples_of_one_kind_are_both_found(records):

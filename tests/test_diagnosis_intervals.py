@@ -13,7 +13,8 @@ from drivelink import jointfile
 from drivelink.errors import JointFileError
 from estimator.batch import fit
 from estimator.diagnosis.covariance import hac_covariance
-from estimator.diagnosis.hypothesis import Fitted, Problem
+from estimator.diagnosis.hypothesis import Fitted
+from estimator.diagnosis.problem import Problem
 from estimator.model import JointModel
 from estimator.sample import SIGMA_95, FloatArray, Record
 

@@ -16,8 +16,8 @@ from estimator import fit
 from estimator.diagnosis import Diagnosis, Errors, Finding, diagnose
 from estimator.diagnosis.curves import _bases
 from estimator.diagnosis.heldout import Held
-from estimator.diagnosis.hypothesis import Problem
 from estimator.diagnosis.order import raised
+from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.verdict import Judge, _Judged
 from estimator.identify import identify

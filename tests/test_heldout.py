@@ -11,7 +11,7 @@ import pytest
 from estimator.batch import fit_joint
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.heldout import held_out
-from estimator.diagnosis.hypothesis import Problem
+from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
 from estimator.harm import Unseen, _Figure, harm, harm_of_parts

@@ -227,7 +227,7 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float, ripples: in
         smooth = smoothing_rad_s * choice("softer") ** np.arange(3)
         smooth = smooth[smooth <= max(most, smoothing_rad_s)]
         if kind.name == "stribeck_friction":
-            fast = _rms(c.velocity) * np.geomspace(0.04, 0.8, 7)
+            fast = _rms(c.velocity) * np.geomspace(0.01, 0.8, 9)
             return [
                 {**fixed, "smoothing_rad_s": float(s), "stribeck_velocity_rad_s": float(v)}
                 for s in smooth

@@ -17,7 +17,8 @@ from scipy.cluster.vq import kmeans2
 from scipy.stats import t as student
 
 from estimator.choices import choice, whole
-from estimator.diagnosis.hypothesis import Fitted, Problem, stretches
+from estimator.diagnosis.hypothesis import Fitted
+from estimator.diagnosis.problem import Problem, stretches
 from estimator.sample import SIGMA_95, FloatArray
 
 __all__ = ["design_effects", "hac_covariance"]

@@ -11,8 +11,9 @@ from scipy.signal import lfilter
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import reverses
+from estimator.diagnosis.design_matrix import Extra
 from estimator.diagnosis.frame import Frame
-from estimator.diagnosis.hypothesis import Extra, Fitted
+from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.search import Search
 from estimator.effects import Coordinates
 from estimator.sample import FloatArray

@@ -11,9 +11,10 @@ from estimator.choices import choice
 from estimator.diagnosis.candidates import columns
 from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.design_matrix import curve_columns
-from estimator.diagnosis.hypothesis import Fitted, Problem
+from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.joint_priors import longest_delay_s
-from estimator.diagnosis.probabilities import Standing
+from estimator.diagnosis.probabilities import Standing, accounts
+from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Curve, Finding, Refitted, Rival, Series
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
@@ -37,9 +38,10 @@ _CHANNELS = {"torque_delay": "torque_delay_s", "deflection_offset": "deflection_
 
 
 def findings_of(
-    problem: Problem, found: Fitted, null: Fitted, standings: Sequence[Standing], surplus: float
+    search: Search, found: Fitted, standings: Sequence[Standing], surplus: float
 ) -> list[Finding]:
     """Return the effects, the most important first, including delays of more than a sample."""
+    problem, null = search.problem, search.null
     std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, found, surplus)), 0.0))
     made = []
     total = float(np.sum(null.posterior.sigma**2))
@@ -69,19 +71,32 @@ def findings_of(
         )
         if not _everyday(problem, finding):
             made.append((share, finding))
-    for slot, x, sigma in zip(found.slots, found.posterior.x, std, strict=True):
-        value = slot.taken + float(x)
-        late = abs(value) > problem.period_s + choice("sure") * sigma
-        if slot.kind == "everyday" and slot.name in DELAYS and late:
-            kind = LIBRARY[slot.name]
-            made.append((0.0, Finding(
-                name=slot.name, location=kind.location, motor=slot.motor, parameters={"delay_s": value},
-                std={"delay_s": float(sigma)},
-                probability=NormalDist().cdf((abs(value) - problem.period_s) / sigma),
-            )))  # fmt: skip
+    made += [(0.0, late) for late in _late(search, found, std)]
     made += [(0.0, f) for f in _offsets(problem, found, std)] if not made else []
     made.sort(key=lambda pair: -pair[0])
     return [finding for _, finding in made]
+
+
+def _late(search: Search, found: Fitted, std: FloatArray) -> list[Finding]:
+    """Delays of readings beyond a sample; each may also be what another effect would be in its place."""
+    problem, made = search.problem, []
+    for slot, x, sigma in zip(found.slots, found.posterior.x, std.tolist(), strict=True):
+        value, beyond = slot.taken + float(x), abs(slot.taken + float(x)) - problem.period_s
+        if slot.kind != "everyday" or slot.name not in DELAYS or beyond <= choice("sure") * sigma:
+            continue
+        key = slot.name, slot.motor
+        each = search.children(problem.with_declared(found, key))
+        instead = accounts(search.held, next((h for h in each if key in h.keys), found), each)
+        others = [(weight, one.terms[-1].candidate) for weight, one in instead if key not in one.keys]
+        listed = [(weight, c.kind.name) for weight, c in others if weight > choice("even")]
+        made.append(Finding(
+            name=slot.name, location=LIBRARY[slot.name].location, motor=slot.motor,
+            parameters={"delay_s": value}, std={"delay_s": sigma},
+            probability=NormalDist().cdf(beyond / sigma) * (1.0 - sum(weight for weight, _ in others)),
+            alternatives=tuple(name for _, name in sorted(listed, reverse=True)),
+            alternative_probabilities=tuple(weight for weight, _ in sorted(listed, reverse=True)),
+        ))  # fmt: skip
+    return made
 
 
 def _offsets(problem: Problem, found: Fitted, std: FloatArray) -> list[Finding]:

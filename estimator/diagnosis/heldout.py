@@ -13,7 +13,8 @@ from scipy.special import softmax
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import members
-from estimator.diagnosis.hypothesis import Fitted, Problem, stretches
+from estimator.diagnosis.hypothesis import Fitted
+from estimator.diagnosis.problem import Problem, stretches
 from estimator.diagnosis.result import Errors
 from estimator.sample import FloatArray, Record
 
@@ -140,12 +141,22 @@ class Held:
 
     def margin(self, found: Fitted, rest: Fitted) -> float:
         """Return how many times more than `confirms` asks for one model gains over another."""
-        laws = found.families <= rest.families and found.parameters > rest.parameters
-        least = float(np.mean(self._least(rest))) if laws else choice("floor") ** 2
+        least = float(np.mean(self._least(rest))) if _refines(found, rest) else choice("floor") ** 2
         fall = (self.squared(rest) - self.squared(found)) / least
         both = found, rest
-        gain = self.scores(found, both) - self.scores(rest, both)
-        return min(fall, float(np.mean(gain) / max(np.std(gain, ddof=1) / np.sqrt(len(gain)), 1e-300)))
+        return min(fall, _in_errors(self.scores(found, both) - self.scores(rest, both)))
+
+    def _preferred(self, found: Fitted, models: Sequence[Fitted]) -> list[bool]:
+        """Whether each says more of the phenomena of the one found and held-out data ask for it, be it for
+        less than laws leave anyway; none that they tell from the best of these.
+        """
+
+        def beats(one: Fitted, other: Fitted) -> bool:
+            return _in_errors(self.scores(one) - self.scores(other)) > 1.0
+
+        richer = [one for one in models if _refines(one, found) and beats(one, found)]
+        best = max(richer, key=lambda one: float(np.mean(self.scores(one))), default=found)
+        return [one in richer and not beats(best, one) for one in models]
 
     def simplest(self, models: Sequence[Fitted]) -> Fitted:
         """Return the simplest of the models that held-out data cannot tell from the best, and over which no
@@ -185,6 +196,7 @@ class Held:
 
         The weight is the mean over Bayesian bootstraps of the blocks (pseudo-BMA+ of Yao, Vehtari, Simpson
         and Gelman, Bayesian Analysis 13, 2018). A difference to the one found that is not confirmed is none.
+        A richer law that the data prefer and that laws' errors hide is as likely as the one found.
         """
         errors = self._independent(found)
         gain = np.array([self.scores(one, models) - self.scores(found, models) for one in models])
@@ -192,6 +204,8 @@ class Held:
         least = np.array([-np.inf if self.confirms(found, one) else 0.0 for one in models])
         most = np.array([np.inf if self.confirms(one, found) else 0.0 for one in models])
         prior = np.array([one.log_prior(errors, self.price) for one in models])
+        as_likely = np.array(self._preferred(found, models))
+        prior = np.where(as_likely, np.maximum(prior, found.log_prior(errors, self.price)), prior)
         odds = np.clip(errors * (shares @ gain.T), least, most) + prior
         return np.asarray(np.mean(softmax(odds, axis=1), axis=0))
 
@@ -226,6 +240,16 @@ class Held:
         if self.other is not None or len(self.problem.records) < 2:
             return None
         return _errors(self.residuals(before)[k], self.residuals(after)[k])
+
+
+def _refines(one: Fitted, other: Fitted) -> bool:
+    """Whether a model has laws of the same phenomena with more parameters."""
+    return one.families <= other.families and one.parameters > other.parameters
+
+
+def _in_errors(gain: FloatArray) -> float:
+    """Mean gain of the blocks (n,) in its standard errors."""
+    return float(np.mean(gain) / max(np.std(gain, ddof=1) / np.sqrt(len(gain)), 1e-300))
 
 
 def held_out(problem: Problem, validation: Record | None = None) -> Held:

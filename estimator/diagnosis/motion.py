@@ -19,10 +19,12 @@ from scipy.stats import qmc
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import Candidate, grid
+from estimator.diagnosis.design_matrix import Term
 from estimator.diagnosis.fourier import Limits, Shape
 from estimator.diagnosis.heldout import Held
-from estimator.diagnosis.hypothesis import Fitted, Problem, Term, count_of
+from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.law_parameters import start
+from estimator.diagnosis.problem import Problem, count_of
 from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
 from estimator.driven import driven
@@ -280,7 +282,7 @@ def _model(problem: Problem, fitted: Fitted, link: LinkDynamics) -> JointModel:
             name=kind.name, parameters={**dict(zip(kind.linear, sizes, strict=True)), **term.values}
         )
         (at_link if kind.on_link else motors[term.candidate.motor or 0]).append(effect)
-    fit = fitted.moved_base(problem).parameters(problem.frames[0])
+    fit = fitted.moved_base(problem.frames[0]).parameters(problem.frames[0])
     declared = [dict(motor.transmission.parameters) for motor in problem.model.motors]
     parameters = [
         known or own for known, own in zip(declared, fit, strict=True)
@@ -298,7 +300,10 @@ def _model(problem: Problem, fitted: Fitted, link: LinkDynamics) -> JointModel:
 
 def _link(problem: Problem, fitted: Fitted) -> LinkDynamics:
     """The dynamics of a link that nobody declared, by eq 4 and the fitted spring."""
-    (frame, *_), motors = problem.at(fitted.corrections, fitted.moved_base(problem)), problem.model.motors
+    (frame, *_), motors = (
+        problem.at(fitted.corrections, fitted.moved_base(problem.frames[0])),
+        problem.model.motors,
+    )
     c = frame.motors[0]
     q = c.link_position
     columns = [c.link_acceleration, c.link_velocity, np.sin(q), np.cos(q)]

@@ -12,7 +12,7 @@ from estimator.diagnosis.candidates import AGAIN
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Fitted, Keys
 
-__all__ = ["Standing", "accounts", "standing"]
+__all__ = ["Standing", "accounts", "believed", "standing"]
 
 
 class Standing(NamedTuple):
@@ -34,6 +34,12 @@ def accounts(held: Held, found: Fitted, others: Sequence[Fitted]) -> list[tuple[
             best[one.keys] = max(best.get(one.keys, one), one, key=lambda h: float(np.mean(held.scores(h))))
     every = [found, *best.values()]
     return list(zip(held.weights(every, found).tolist(), every, strict=True))
+
+
+def believed(held: Held, found: Fitted, others: Sequence[Fitted]) -> Fitted:
+    """Return the hypothesis without the effects that are less probable than their absence."""
+    every = accounts(held, found, others)
+    return max((pair for pair in every if pair[1].named <= found.named), key=lambda pair: pair[0])[1]
 
 
 def _twins(key: tuple[str, int | None], beside: Keys, linked: bool) -> list[str]:

@@ -17,10 +17,12 @@ from scipy.special import softmax
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import Candidate, columns, grid, members
+from estimator.diagnosis.design_matrix import Term
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.heldout import Held
-from estimator.diagnosis.hypothesis import Fitted, Keys, Problem, Term
+from estimator.diagnosis.hypothesis import Fitted, Keys
 from estimator.diagnosis.joint_priors import effect_std
+from estimator.diagnosis.problem import Problem
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray
 
@@ -222,9 +224,11 @@ class Search:
             return max(child, *others, key=lambda h: h.evidence(child))
         if _SMOOTHING not in term.values:
             return child
+        sharpest = next(e.values[0] for e in self._library if e.candidate == term.candidate)
         softer = {**term.values, _SMOOTHING: choice("softer") * term.values[_SMOOTHING]}
-        other = self.problem.added(parent, Term(term.candidate, softer), whole("rough_steps"))
-        return max(child, other, key=lambda h: h.evidence(child))
+        starts = [softer] if term.values == sharpest else [softer, dict(sharpest)]
+        others = [self.problem.added(parent, Term(term.candidate, v), whole("rough_steps")) for v in starts]
+        return max(child, *others, key=lambda h: h.evidence(child))
 
     def ranked(self, hypotheses: Sequence[Fitted]) -> list[Fitted]:
         """Return the best by held-out blocks first, without duplicates."""

@@ -9,7 +9,8 @@ import numpy as np
 from estimator.choices import whole
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.frame import Frame
-from estimator.diagnosis.hypothesis import Fitted, Problem
+from estimator.diagnosis.hypothesis import Fitted
+from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import StiffnessCurve
 from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import TransmissionModel

@@ -20,7 +20,7 @@ from estimator.diagnosis.findings import (
 )
 from estimator.diagnosis.heldout import errors_of, wider
 from estimator.diagnosis.hypothesis import Fitted
-from estimator.diagnosis.probabilities import accounts, standing
+from estimator.diagnosis.probabilities import accounts, believed, standing
 from estimator.diagnosis.result import Diagnosis, Errors, Finding, RecordingErrors, Refitted, Verdict
 from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.stiffness import stiffness_curves
@@ -55,14 +55,15 @@ class Judge:
 
     Args:
         search: the candidates.
-        found: the explanation that held-out data confirm.
+        found: the explanation that held-out data confirm, from which improbable effects are taken.
         progress: called with the current step.
     """
 
     def __init__(self, search: Search, found: Fitted, progress: Progress) -> None:
-        self.search, self.held, self.found = search, search.held, found
+        self.search, self.held = search, search.held
         self.problem, self.progress = search.problem, progress
-        self.surplus = self.held.surplus(found)
+        self.found = believed(self.held, found, search.seen)
+        self.surplus = self.held.surplus(self.found)
 
     def diagnosis(self) -> Diagnosis:
         """Make verdict, findings and errors."""
@@ -72,7 +73,7 @@ class Judge:
         beside = accounts(self.held, self.found, seen)
         linked = self.problem.frames[0].linked
         standings = [standing(self.found, k, beside, linked) for k in range(len(self.found.terms))]
-        effects = findings_of(self.problem, self.found, self.search.null, standings, self.surplus)
+        effects = findings_of(self.search, self.found, standings, self.surplus)
         return self._stated(self._judged(effects, curve), beside)
 
     def _judged(self, effects: list[Finding], curve: Fitted | None) -> _Judged:

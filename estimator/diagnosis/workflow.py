@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from estimator.choices import least_rows
 from estimator.diagnosis.bandwidth import choose_bandwidth, widest
 from estimator.diagnosis.heldout import held_out
-from estimator.diagnosis.hypothesis import Problem
 from estimator.diagnosis.order import raised
+from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.verdict import Judge

@@ -43,6 +43,7 @@ RANGES: dict[str, Range] = {  # the longest end that fits counts
     "_rad_s_per_count": Range(1e-15, 1e6, "rad/s"),
     "_nm": Range(1e-12, 1e9, "N·m"),
     "_nm_rad": Range(1e-9, 1e12, "N·m/rad"),
+    "coefficient": Range(1e-12, 1e30, ""),  # of a power of the deflection: the fifth of 1 mrad is 1e-15
     "coefficients_nm_rad": Range(1e-9, 1e30, "N·m/rad, N·m/rad³, …"),  # the ninth power of 1 mrad is 1e-27
     "_nm_rad2": Range(1e-9, 1e12, "N·m/rad²"),
     "_nm_s_rad": Range(1e-12, 1e9, "N·m·s/rad"),

@@ -166,6 +166,13 @@ def test_damping_zero_and_parameters_of_sure_effects_are_tested_for_changes_and_
     assert drawn.count('class="when"') == (3 if probability == 1.0 else 2)
 
 
+def test_a_linear_axis_has_metres_and_newtons():
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) | {"axis": "linear"} for k in range(10)]
+    text = page(summarise(rows, 0.05))
+    assert "at a deflection of 0.02 m, N/m; scatter" in text and "viscous damping, N·s/m<" in text
+    assert "N·m" not in text and " rad" not in text
+
+
 def test_a_stiffness_that_says_nothing_at_the_common_deflection_is_no_point():
     rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
     rows[4] |= {"covariance": [80.0**2]}

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from drivelink.fleet.summary import LOOK, STATES, parameter_name, spaced
 from drivelink.output.document import Block, Document, Grid, Markup, Paragraph, Rows, Section, drawn
 from drivelink.output.document import page as draw
-from drivelink.output.numbers import Units, in_words, number, with_interval
+from drivelink.output.numbers import in_words, number, with_interval
 from estimator.sample import SIGMA_95
 
 _CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large
@@ -171,11 +171,10 @@ def _small(joint: dict[str, Any], one: dict[str, Any]) -> str:
          "std_nm_rad": p["std"] or 0.0, "report": p["report"], "verdict": ""}
         for p in one["series"]
     ]  # fmt: skip
-    unit = Units(False).of(one["name"])
-    shown = {"series": series, "changes": one["changes"], "unit": unit}
+    shown = {"series": series, "changes": one["changes"], "unit": one["unit"]}
     frame = _frame(joint, shown, _LEFT, 0.5 * _WIDTH - _LEFT - _RIGHT, 110.0)
     body = _axes(frame, 132.0) + _bands(shown, frame) + _fitted(shown, frame) + _points(shown, frame)
-    words = [parameter_name(one["name"]), unit]
+    words = [parameter_name(one["name"]), one["unit"]]
     if len(joint["transmissions"]) > 1:
         words.append(f"motor {one['motor']}")
     return (
@@ -193,7 +192,8 @@ def _figure(joint: dict[str, Any], one: dict[str, Any]) -> str:
     parts += [_strip(joint, effect, frame, _HEIGHT + _ROW * (k + 0.8)) for k, effect in enumerate(rows)]
     several = f" of motor {one['transmission']}" if len(joint["transmissions"]) > 1 else ""
     caption = (
-        f"Stiffness{several} at a deflection of {one['deflection_rad']:.3g} rad, N·m/rad; scatter "
+        f"Stiffness{several} at a deflection of {one['deflection_rad']:.3g} "
+        f"{one['deflection_unit']}, {one['unit']}; scatter "
         f"{100 * one['scatter_relative']:.2g} %, q = {one['q_value']:.2g}. × at the bottom: a recording that "
         "shows no stiffness. A click opens the diagnosis."
     )
@@ -273,7 +273,7 @@ def _points(one: dict[str, Any], frame: _Frame) -> str:
     for p in one["series"]:
         x, reach = frame.x(p["time"]), SIGMA_95 * p["std_nm_rad"]
         y, low, high = (frame.y(p["stiffness_nm_rad"] + d) for d in (0.0, -reach, reach))
-        value = with_interval(p["stiffness_nm_rad"], reach, one.get("unit", "N·m/rad"))
+        value = with_interval(p["stiffness_nm_rad"], reach, one["unit"])
         tip = ", ".join(filter(None, (f"{_minute(p['time'])}: {value}", p["verdict"])))
         bar = f'<line class="bar" x1="{x:.1f}" x2="{x:.1f}" y1="{low:.1f}" y2="{high:.1f}"/>'
         kind = "dot full" if p["verdict"] in ("sufficient", "") else "dot"

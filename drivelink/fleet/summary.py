@@ -13,7 +13,7 @@ from scipy.stats import false_discovery_control
 from drivelink import __version__
 from drivelink.fleet.changes import LEAST, Appearance, appearance, iso, lost, unusable
 from drivelink.fleet.trends import Series, others, parameter, stiffnesses, transmission
-from drivelink.output.numbers import Units, bare_name, in_words, with_interval
+from drivelink.output.numbers import bare_name, in_words, with_interval
 from estimator.sample import SIGMA_95
 
 SCHEMA = "drivelink.fleet/1"
@@ -23,7 +23,7 @@ _METHOD = (
 )
 COLUMNS = [
     "joint", "transmission", "status", "error", "verdict", "sentence", "effects", "report",
-    "model", "parameters", "covariance", "excited", "error_before_relative", "error_after_relative",
+    "axis", "model", "parameters", "covariance", "excited", "error_before_relative", "error_after_relative",
     "deflection_middle_rad", "stiffness_middle_nm_rad", "stiffness_std_middle_nm_rad",
     "viscous_damping_nm_s_rad", "viscous_damping_std_nm_s_rad", "deflection_offset_rad",
     "deflection_offset_std_rad", "inertia_kg_m2", "inertia_std_kg_m2", "details",
@@ -271,7 +271,7 @@ def _moved(one: dict[str, Any], change: dict[str, Any]) -> tuple[str, str]:
             "the torque's scale" if c == "torque_scale" else in_words(c) for c in change["causes"]
         )
     else:
-        amount, half, unit = change["amount"], change["amount_std"], Units(False).of(one["name"])
+        amount, half, unit = change["amount"], change["amount_std"], one["unit"]
         what = parameter_name(one["name"])
     return what, f"{'+' * (amount > 0.0)}{with_interval(amount, SIGMA_95 * half, unit)}"
 

@@ -40,7 +40,7 @@ SCHEMA = pa.schema([
     ("status", _TEXT), ("error", _TEXT), ("verdict", _TEXT), ("sentence", _TEXT),
     ("effects", pa.list_(pa.string())), ("details", _TEXT), ("error_before_rms_nm", _REAL),
     ("error_after_rms_nm", _REAL), ("error_before_relative", _REAL), ("error_after_relative", _REAL),
-    ("validated_on", _TEXT), ("model", _TEXT), *_NAMED, ("parameters", _TEXT),
+    ("validated_on", _TEXT), ("axis", _TEXT), ("model", _TEXT), *_NAMED, ("parameters", _TEXT),
     ("parameters_std", _TEXT), ("covariance", pa.list_(pa.float64())), ("inertia_kg_m2", _REAL),
     ("inertia_std_kg_m2", _REAL), ("viscous_damping_nm_s_rad", _REAL),
     ("viscous_damping_std_nm_s_rad", _REAL), ("deflection_offset_rad", _REAL),

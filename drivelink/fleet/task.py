@@ -249,7 +249,7 @@ def _results(
             folder = f"diagnoses/{joint.name}/{row['digest'][:24]}{suffix}"
             common = row | analysis.joint | {
                 "status": "done", "error": None, "part": piece.part, "parts": piece.parts,
-                "validated_on": where, "report": f"{folder}/report.html",
+                "axis": file.axis, "validated_on": where, "report": f"{folder}/report.html",
                 "time": row["time"] and row["time"] + timedelta(seconds=at - begin),
             }  # fmt: skip
             for one in analysis.transmissions:

@@ -21,6 +21,7 @@ from drivelink.fleet.changes import (
     series_test,
     usable,
 )
+from drivelink.output.numbers import Units
 from estimator.diagnosis.stiffness import Middle
 from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import MODELS
@@ -44,6 +45,11 @@ class Series(NamedTuple):
     def p_value(self) -> float | None:
         """That it is constant."""
         return self.test and self.test.p_value
+
+    @property
+    def units(self) -> Units:
+        """Those of the joint's axis."""
+        return Units(self.points[-1].row["axis"] == "linear")
 
 
 def stiffnesses(rows: list[dict[str, Any]]) -> list[Series]:
@@ -88,6 +94,8 @@ def transmission(series: Series, q: float, level: float) -> dict[str, Any]:
     return {
         "transmission": series.transmission,
         "deflection_rad": series.deflection_rad,
+        "unit": series.units.shown("N·m/rad"),
+        "deflection_unit": series.units.shown("rad"),
         "p_value": series.p_value,
         "q_value": q,
         "significant": bool(level),
@@ -121,6 +129,7 @@ def parameter(series: Series, q: float, level: float) -> dict[str, Any]:
     return {
         "name": series.name,
         "motor": series.transmission,
+        "unit": series.units.of(series.name),
         "q_value": q,
         "changes": [
             _changed(series, one)

@@ -298,9 +298,9 @@ def _previous(sources: list[Source], joints: Joints, shared: Any, client: Client
 
     Workers read joint and time of MCAP files; others are known by name and date.
     """
-    known = {s.url: _listed(s, joints) for s in sources if not s.name.lower().endswith(".mcap")}
-    asked = [s for s in sources if s.url not in known]
-    known |= dict(client.gather(client.map(_identified, asked, joints=shared, pure=False)))
+    carrying = [s for s in sources if _carries(s)]
+    known = dict(_identified(s, joints) for s in sources if not _carries(s))
+    known |= dict(client.gather(client.map(_identified, carrying, joints=shared, pure=False)))
     order: dict[str, list[tuple[datetime, str, Source]]] = {}
     for source in sources:
         joint, when = known[source.url]
@@ -313,16 +313,14 @@ def _previous(sources: list[Source], joints: Joints, shared: Any, client: Client
     return before
 
 
-def _listed(source: Source, joints: Joints) -> tuple[str | None, datetime | None]:
-    try:
-        name = joints.named(source.url).name
-    except Exception:  # noqa: BLE001 - the task itself says what is wrong
-        name = None
-    return name, named_time(source) or source.modified
+def _carries(source: Source) -> bool:
+    return source.name.lower().endswith(".mcap")
 
 
 def _identified(source: Source, joints: Joints) -> tuple[str, tuple[str | None, datetime | None]]:
     try:
+        if not _carries(source):
+            return source.url, (joints.named(source.url).name, named_time(source) or source.modified)
         with fetched(source) as (path, _):
             joint = carried_joint(path)
             name = joint.name if joint else joints.named(source.url).name

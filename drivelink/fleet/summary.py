@@ -30,6 +30,7 @@ COLUMNS = [
 ]  # fmt: skip
 
 _SHOWN = ("recording", "verdict", "effects", "sentence", "report")  # of a diagnosis
+_Judged = dict[str, list[dict[str, Any]]]  # "transmissions", "parameters" and "effects" of a joint
 _NO_PLACE = {"sufficient", "insufficient_excitation"}
 
 
@@ -41,10 +42,6 @@ class _Place(NamedTuple):
     names: list[str]  # all, the most frequent first
     best: list[str]  # those that the test is of
     test: Appearance
-
-    @property
-    def p_value(self) -> float | None:
-        return self.test.p_value
 
 
 def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[str, Any]:
@@ -63,25 +60,25 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
     series = {name: stiffnesses(one) for name, one in joints.items()}
     further = {name: others(one) for name, one in joints.items()}
     places = {name: _places(one) for name, one in joints.items()}
-    every: list[Series | _Place] = [
-        s for of in (series, further, places) for ones in of.values() for s in ones
-    ]
-    tests = [(id(one), one.p_value) for one in every if one.p_value is not None]
-    found = false_discovery_control([p for _, p in tests]).tolist() if tests else []
-    level = false_discovery_rate * sum(q <= false_discovery_rate for q in found) / max(len(tests), 1)
-    q_of = dict(zip((key for key, _ in tests), found, strict=True))
-    # level at which changes are looked for; 0: the series does not change
-    levels = {id(one): level * (q_of.get(id(one), 1.0) <= false_discovery_rate) for one in every}
+    every = [one for of in (series, further, places) for ones in of.values() for one in ones]
+    p = {id(one): one.test.p_value for one in every if one.test is not None}
+    found = false_discovery_control([*p.values()]).tolist() if p else []
+    level = false_discovery_rate * sum(q <= false_discovery_rate for q in found) / max(len(p), 1)
+    q_of = dict(zip(p, found, strict=True))
+
+    def judged(one: Series | _Place) -> tuple[float, float]:
+        """Its q, and the level at which changes are looked for; 0: there is none."""
+        q = q_of.get(id(one), 1.0)
+        return q, level if q <= false_discovery_rate else 0.0
+
     documents = [
-        _joint(
-            name,
-            one,
-            [transmission(s, q_of.get(id(s), 1.0), levels[id(s)]) for s in series[name]],
-            [parameter(s, q_of.get(id(s), 1.0), levels[id(s)]) for s in further[name]],
-            [_effect(place, q_of[id(place)], false_discovery_rate) for place in places[name]],
-        )
+        _joint(name, one, {
+            "transmissions": [transmission(s, *judged(s)) for s in series[name]],
+            "parameters": [parameter(s, *judged(s)) for s in further[name]],
+            "effects": [_effect(place, *judged(place)) for place in places[name]],
+        })
         for name, one in joints.items()
-    ]
+    ]  # fmt: skip
     documents.sort(key=lambda d: (-d["urgency"], d["joint"]))
     times = [row["time"] for row in rows if row["time"] is not None]
     broken = [row for row in rows if row["status"] != "done"]
@@ -91,7 +88,7 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "false_discovery_rate": false_discovery_rate,
         "method": _METHOD,
-        "tests": len(tests),
+        "tests": len(p),
         "level": level,
         "recordings": len({row["recording"] for row in rows}),
         "from": iso(min(times)) if times else None,
@@ -126,8 +123,8 @@ def _places(rows: list[dict[str, Any]]) -> list[_Place]:
     return made
 
 
-def _effect(place: _Place, q: float, rate: float) -> dict[str, Any]:
-    shown = place.best if q <= rate else place.names
+def _effect(place: _Place, q: float, level: float) -> dict[str, Any]:
+    shown = place.best if level else place.names
     names = set(shown)
     seen = [
         row
@@ -142,8 +139,8 @@ def _effect(place: _Place, q: float, rate: float) -> dict[str, Any]:
         "names": shown,
         "p_value": place.test.p_value,
         "q_value": q,
-        "significant": q <= rate,
-        "since": iso(place.rows[place.test.first]["time"]) if q <= rate else iso(seen[0]["time"]),
+        "significant": bool(level),
+        "since": iso((place.rows[place.test.first] if level else seen[0])["time"]),
         "share_before": place.test.rate_before,
         "share_after": place.test.rate_after,
         "recordings": len(seen),
@@ -155,33 +152,25 @@ def _effect(place: _Place, q: float, rate: float) -> dict[str, Any]:
     }
 
 
-def _joint(
-    name: str,
-    rows: list[dict[str, Any]],
-    transmissions: list[dict[str, Any]],
-    others: list[dict[str, Any]],
-    effects: list[dict[str, Any]],
-) -> dict[str, Any]:
+def _joint(name: str, rows: list[dict[str, Any]], judged: _Judged) -> dict[str, Any]:
     done = [row for row in rows if row["status"] == "done"]
     broken = [row for row in rows if row["status"] != "done"]
     last = done[-1] if done else None
-    shown = {(p["report"], t["transmission"]) for t in transmissions for p in t["series"]}
+    shown = {(p["report"], t["transmission"]) for t in judged["transmissions"] for p in t["series"]}
     without = unusable(rows, shown)
-    gone = lost(transmissions, without)
-    state, size = _state(transmissions, others, effects, last, gone)
+    gone = lost(judged["transmissions"], without)
+    state, size = _state(judged, last, gone)
     return {
         "joint": name,
         "state": state,
         "urgency": STATES[state] + min(size, 0.999),
-        "sentence": _sentence(state, transmissions, others, effects, rows, gone),
+        "sentence": _sentence(state, judged, rows, gone),
         "recordings": len({row["recording"] for row in rows}),
         "broken": len(broken),
         "last": iso(rows[-1]["time"]),
         "verdict": last["verdict"] if last else None,
-        "transmissions": transmissions,
+        **judged,
         "unusable": without,
-        "parameters": others,
-        "effects": effects,
         "diagnoses": [
             {**{key: row[key] for key in _SHOWN}, "time": iso(row["time"])}
             for row in done
@@ -194,50 +183,36 @@ STATES = {"changing": 5.0, "lost": 4.0, "finding": 3.0, "unread": 2.0, "undecide
 LOOK = ("changing", "lost", "finding", "unread")  # those that need a look
 
 
-def _state(
-    transmissions: list[dict[str, Any]],
-    others: list[dict[str, Any]],
-    effects: list[dict[str, Any]],
-    last: dict[str, Any] | None,
-    gone: list[dict[str, Any]],
-) -> tuple[str, float]:
+def _state(judged: _Judged, last: dict[str, Any] | None, gone: list[dict[str, Any]]) -> tuple[str, float]:
     """Urgency of a joint, and relative size of the change to sort by."""
-    moved = [abs(c["amount_relative"]) for t in transmissions for c in t["changes"]]
-    moved += [c["share"] for one in others for c in one["changes"]]
-    appeared = [
-        abs(e["error_before_relative"] - e["error_after_relative"]) for e in effects if e["significant"]
-    ]
-    if moved or appeared:
-        return "changing", max(moved + appeared)
+    moved = [abs(c["amount_relative"]) for t in judged["transmissions"] for c in t["changes"]]
+    moved += [c["share"] for one in judged["parameters"] for c in one["changes"]]
+    new = [e for e in judged["effects"] if e["significant"]]
+    moved += [abs(e["error_before_relative"] - e["error_after_relative"]) for e in new]
+    if moved:
+        return "changing", max(moved)
     if gone:
         return "lost", 0.1 * len(gone)
     if last is None:
         return "unread", 0.0
     if last["verdict"] not in _NO_PLACE:
         return "finding", abs(last["error_before_relative"] - last["error_after_relative"])
-    if not transmissions or last["verdict"] == "insufficient_excitation":
+    if not judged["transmissions"] or last["verdict"] == "insufficient_excitation":
         return "undecided", 0.0
     return "steady", 0.0
 
 
-def _sentence(
-    state: str,
-    transmissions: list[dict[str, Any]],
-    others: list[dict[str, Any]],
-    effects: list[dict[str, Any]],
-    rows: list[dict[str, Any]],
-    gone: list[dict[str, Any]],
-) -> str:
+def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: list[dict[str, Any]]) -> str:
     """Summary of a joint in words."""
     said = []
     several = any(row["transmission"] == 2 for row in rows)
-    for one in (*transmissions, *others):
+    for one in (*judged["transmissions"], *judged["parameters"]):
+        of = f" of motor {one.get('transmission') or one['motor']}" if several else ""
         for change in one["changes"]:
             what, much = _moved(one, change)
-            of = f" of motor {one.get('transmission') or one['motor']}" if several else ""
             verb, since = ("stepped", "on") if change["kind"] == "step" else ("has drifted", "since")
             said.append(f"{what[0].upper()}{what[1:]}{of} {verb} by {much} {since} {change['since'][:10]}.")
-    for effect in effects:
+    for effect in judged["effects"]:
         if effect["significant"]:
             names = " or ".join(map(in_words, effect["names"][:2]))
             said.append(f"New at the {spaced(effect['location'])} since {effect['since'][:10]}: {names}.")
@@ -257,7 +232,7 @@ def _sentence(
         return f"No significant change, but the last recording says: {last['sentence']}"
     if state == "undecided":
         return "The motion does not reveal the stiffness or what could be missing: record a richer one."
-    fewest = min(len(one["series"]) for one in transmissions)
+    fewest = min(len(one["series"]) for one in judged["transmissions"])
     if fewest < LEAST:
         return f"Too few recordings with a stiffness to judge a change: {fewest}, of {LEAST} or more."
     return "Steady."

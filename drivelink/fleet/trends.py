@@ -42,11 +42,6 @@ class Series(NamedTuple):
     test: SeriesTest | None  # None: too few, or no intervals
 
     @property
-    def p_value(self) -> float | None:
-        """That it is constant."""
-        return self.test and self.test.p_value
-
-    @property
     def units(self) -> Units:
         """Those of the joint's axis."""
         return Units(self.points[-1].row["axis"] == "linear")
@@ -90,13 +85,13 @@ def transmission(series: Series, q: float, level: float) -> dict[str, Any]:
     """Return a stiffness for fleet.json; its changes are looked for at a level, 0: it does not change."""
     found, fitted, base = _changes(series, level)
     inertias = _inertia(series, found)
-    scatter = series.test.scatter if series.test else float(np.std(series.value))
+    p_value, scatter = series.test or (1.0, float(np.std(series.value)))
     return {
         "transmission": series.transmission,
         "deflection_rad": series.deflection_rad,
         "unit": series.units.shown("N·m/rad"),
         "deflection_unit": series.units.shown("rad"),
-        "p_value": series.p_value,
+        "p_value": p_value,
         "q_value": q,
         "significant": bool(level),
         "stiffness_nm_rad": float(fitted[-1]),

@@ -169,14 +169,8 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _summary(counts: Counts) -> str:
-    parts = [f"{counts.done} done"]
-    for number, what in (
-        (counts.known, "there already"),
-        (counts.early, "too early"),
-        (counts.broken, "broken"),
-    ):
-        if number:
-            parts.append(f"{number} {what}")
+    others = {"there already": counts.known, "too early": counts.early, "broken": counts.broken}
+    parts = [f"{counts.done} done", *(f"{number} {what}" for what, number in others.items() if number)]
     return f"{counts.found} recording{'s' * (counts.found != 1)}: {', '.join(parts)}"
 
 

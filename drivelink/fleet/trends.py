@@ -102,18 +102,7 @@ def transmission(series: Series, q: float, level: float) -> dict[str, Any]:
             | {"causes": _causes(series, one, base, *inertia)}
             for one, inertia in zip(found, inertias, strict=True)
         ],
-        "series": [
-            {
-                "time": iso(point.row["time"]),
-                "stiffness_nm_rad": point.value,
-                "std_nm_rad": point.std,
-                "fitted_nm_rad": float(now),
-                "verdict": point.row["verdict"],
-                "recording": point.row["recording"],
-                "report": point.row["report"],
-            }
-            for point, now in zip(series.points, fitted, strict=True)
-        ],
+        "series": _named(series, fitted, "stiffness_nm_rad", "std_nm_rad", "fitted_nm_rad"),
     }
 
 
@@ -127,21 +116,21 @@ def parameter(series: Series, q: float, level: float) -> dict[str, Any]:
         "unit": series.units.of(series.name),
         "q_value": q,
         "changes": [
-            _changed(series, one)
-            | {"amount": one.amount, "amount_std": one.amount_std, "share": abs(one.amount) / most}
-            for one in found
+            _changed(series, c)
+            | {"amount": c.amount, "amount_std": c.amount_std, "share": abs(c.amount) / most}
+            for c in found
         ],
-        "series": [
-            {
-                "time": iso(row["time"]),
-                "value": value,
-                "std": std,
-                "fitted": float(now),
-                "report": row["report"],
-            }
-            for (row, value, std, _), now in zip(series.points, fitted, strict=True)
-        ],
+        "series": _named(series, fitted, "value", "std", "fitted"),
     }
+
+
+def _named(series: Series, fitted: FloatArray, *names: str) -> list[dict[str, Any]]:
+    """Name value, standard deviation and level of each recording."""
+    return [
+        {"time": iso(row["time"]), **dict(zip(names, (value, std, float(now)), strict=True))}
+        | {key: row[key] for key in ("verdict", "recording", "report")}
+        for (row, value, std, _), now in zip(series.points, fitted, strict=True)
+    ]
 
 
 def _changes(series: Series, level: float) -> tuple[list[SeriesChange], FloatArray, float]:
@@ -196,12 +185,8 @@ def _changed(series: Series, change: SeriesChange) -> dict[str, Any]:
 
 def _relative(series: Series, change: SeriesChange, base: float) -> dict[str, Any]:
     days = (series.time_s[-1] - series.time_s[change.first]) / _DAY_S
-    document = {
-        "amount_nm_rad": change.amount,
-        "amount_std_nm_rad": change.amount_std,
-        "amount_relative": change.amount / base,
-        "amount_std_relative": change.amount_std / base,
-    }
+    document = {"amount_nm_rad": change.amount, "amount_std_nm_rad": change.amount_std}
+    document |= {"amount_relative": change.amount / base, "amount_std_relative": change.amount_std / base}
     if change.kind == "drift" and days > 0.0:
         document["per_30_days_relative"] = change.amount / base / days * 30.0
     return document

@@ -62,22 +62,18 @@ def section(motion: NextMotion, units: Units) -> Section:
         "drive's position loop, and diagnose that recording."
     )
     rows: Rows = []
-    for name, now, told, least in zip(
-        motion.rivals, motion.now, np.diag(motion.told), _least(motion), strict=True
-    ):
-        odds = float(np.exp(np.clip(least, 0.0, np.log(_MOST))))
+    for one in as_json(motion)["rivals"]:
+        odds = float(np.exp(np.clip(one["least_log_odds"], 0.0, np.log(_MOST))))
         against = f"{'> ' if odds > 0.99 * _MOST else ''}{number(odds, 2)} : 1"
-        rows.append((in_words(name), f"{now:.2f}", f"{told:.2f}", against))
+        rows.append((in_words(one["effects"]), f"{one['probability']:.2f}", f"{one['told']:.2f}", against))
     head = (
         "if this is what is missing",
         "probability now",
         "told after the motion",
         "odds over the next best",
     )
-    chart = Chart(
-        lambda: figure(motion, units, _ON_PAGE),
-        "Motion of the motors, and the torque that the likeliest needs.",
-    )
+    caption = "Motion of the motors, and the torque that the likeliest needs."
+    chart = Chart(lambda: figure(motion, units, _ON_PAGE), caption)
     return Section("What to move next", [Paragraph(said), Grid(head, rows), chart])
 
 

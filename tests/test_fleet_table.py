@@ -191,12 +191,13 @@ def test_a_place_where_nothing_is_new_shows_all_that_is_found_there():
     assert (effect["names"], effect["recordings"]) == (["presliding_friction", "cogging"], 10)
 
 
-@pytest.mark.parametrize(("nights", "said"), [(5, "Too few recordings"), (6, "Steady.")])
-def test_no_joint_is_called_steady_by_fewer_recordings_than_show_a_change(nights, said):
-    (joint,) = summarise([night("elbow", k, 150.0 + 0.1 * (k % 2), []) for k in range(nights)], 0.05)[
-        "joints"
-    ]
-    assert joint["sentence"].startswith(said)
+@pytest.mark.parametrize("rigid", [{}, {"model": "none", "excited": False, "deflection_offset_rad": None}])
+@pytest.mark.parametrize(
+    ("nights", "said"), [(1, "Too few recordings"), (5, "Too few recordings"), (6, "Steady.")]
+)
+def test_no_joint_is_called_steady_by_fewer_recordings_than_show_a_change(nights, said, rigid):
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 2), []) | rigid for k in range(nights)]
+    assert sentence(*rows).startswith(said) and page(summarise(rows, 0.05))
 
 
 def test_an_unusable_stiffness_is_no_point_of_the_trend_but_a_cross_on_the_chart():

@@ -15,6 +15,7 @@ from drivelink.fleet.changes import LEAST, Appearance, appearance, iso, lost, un
 from drivelink.fleet.trends import Series, others, parameter, stiffnesses, transmission
 from drivelink.output.numbers import bare_name, in_words, with_interval
 from estimator.sample import SIGMA_95
+from estimator.transmissions import RIGID
 
 SCHEMA = "drivelink.fleet/1"
 _METHOD = (
@@ -197,7 +198,8 @@ def _state(judged: _Judged, last: dict[str, Any] | None, gone: list[dict[str, An
         return "unread", 0.0
     if last["verdict"] not in _NO_PLACE:
         return "finding", abs(last["error_before_relative"] - last["error_after_relative"])
-    if not judged["transmissions"] or last["verdict"] == "insufficient_excitation":
+    unknown = not judged["transmissions"] and last["model"] != RIGID
+    if unknown or last["verdict"] == "insufficient_excitation":
         return "undecided", 0.0
     return "steady", 0.0
 
@@ -232,9 +234,10 @@ def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: lis
         return f"No significant change, but the last recording says: {last['sentence']}"
     if state == "undecided":
         return "The motion does not reveal the stiffness or what could be missing: record a richer one."
-    fewest = min(len(one["series"]) for one in judged["transmissions"])
+    done = sum(row["status"] == "done" for row in rows)
+    fewest = min((len(one["series"]) for one in judged["transmissions"]), default=done)
     if fewest < LEAST:
-        return f"Too few recordings with a stiffness to judge a change: {fewest}, of {LEAST} or more."
+        return f"Too few recordings to judge a change: {fewest}, of {LEAST} or more."
     return "Steady."
 
 

@@ -84,7 +84,7 @@ def _stiffness(row: dict[str, Any], phi: float) -> tuple[float, float]:
 def transmission(series: Series, q: float, level: float) -> dict[str, Any]:
     """Return a stiffness for fleet.json; its changes are looked for at a level, 0: it does not change."""
     found, fitted, base = _changes(series, level)
-    inertias = _inertia(series, found)
+    inertias = _inertia(series, found) if found else []
     p_value, scatter = series.test or (1.0, float(np.std(series.value)))
     return {
         "transmission": series.transmission,

@@ -150,7 +150,7 @@ def test_damping_zero_and_parameters_of_sure_effects_are_tested_for_changes_and_
             "name": "backlash",
             "parameters": {"half_gap_rad": 0.001 * (1 + k) + 1e-5 * rng.standard_normal()},
         }
-        effect |= {"std": {"half_gap_rad": 1e-5}, "probability": probability}
+        effect |= {"std": {"half_gap_rad": 1e-5}, "probability": probability if k else 0.5}
         rows.append(night("elbow", k, 150.0 + 0.1 * rng.standard_normal(), ["backlash@transmission"]))
         rows[-1] |= {
             "viscous_damping_nm_s_rad": 0.8 + 0.08 * k + 0.001 * rng.standard_normal(),

@@ -69,7 +69,8 @@ def others(rows: list[dict[str, Any]]) -> list[Series]:
 def _tested(name: str, motor: int, phi: float, points: list[Point]) -> Series:
     time_s = np.array([p.row["time"].timestamp() for p in points])
     value, std = np.array([p.value for p in points]), np.array([p.std or 0.0 for p in points])
-    able = len(points) >= LEAST and all(p.std and p.sure for p in points)
+    sure = 2 * sum(p.sure for p in points) > len(points)  # most
+    able = sure and len(points) >= LEAST and all(p.std for p in points)
     test = series_test(time_s, value, std) if able else None
     return Series(name, motor, phi, points, time_s, value, std, test)
 

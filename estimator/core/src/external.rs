@@ -22,7 +22,7 @@ pub use paper::PaperMomentum;
 
 use serde::{Deserialize, Serialize};
 
-use crate::choices::{BLOCK_S, BLOCKS, LATEST, LINK_FLOOR, SETTLED, SLOW_S, SURE};
+use crate::choices::{BLOCK_S, BLOCKS, LATEST, LINK_FLOOR, MEAN_S, SETTLED, SLOW_S, SURE};
 use crate::effects::{Coordinates, Element};
 use crate::filters::StateVariableFilter;
 use crate::model::{Link, Model};
@@ -170,6 +170,7 @@ pub struct LinkMomentum {
     dry: f64,          // undeclared dry friction, as a share of the torque carried
     errors: LinkErrors,
     judge: Judge,
+    trailing: f64, // the published torque behind one more delay of the filter
     /// See [`Latest`].
     pub latest: Latest,
 }
@@ -210,6 +211,7 @@ impl LinkMomentum {
             skew: priors.encoder_delay * period_s,
             dry: priors.coulomb_friction,
             errors: LinkErrors::default(),
+            trailing: 0.0,
             latest: Latest::nothing(),
         })
     }
@@ -312,16 +314,23 @@ impl LinkMomentum {
         let (torque, contact) = self.judge.judge(sum - off, self.carried[0], around, white, valid);
         let usual = torque.abs() <= SURE * (around + white).sqrt();
         if valid && usual && !contact {
-            // Errors of readings last as long as the filter does; that of the curve does not average out at all.
-            let curve = carried.variance + (LINK_FLOOR * self.judge.largest).powi(2);
-            let lasting = (read + white + late) / self.filter.bandwidth + curve * MEMORY_S;
-            self.errors.identify(&row, sum - self.measured[0], lasting / self.period);
+            // Errors of readings last as long as the filter does, what the model leaves as long as a motion.
+            let (curve, readings) =
+                (carried.variance + (LINK_FLOOR * self.judge.largest).powi(2), read + white + late);
+            let left = sum - self.measured[0];
+            let doubt = self.errors.doubt(left, curve + readings, self.period);
+            let lasting = (readings / self.filter.bandwidth).max(self.errors.left() * MEAN_S);
+            self.errors.identify(&row, left, doubt * lasting / self.period);
         }
+        // What it has changed by over the filter's delay, it may have changed by since.
+        let moved = torque - self.trailing;
+        self.trailing +=
+            if valid { (self.period * self.filter.bandwidth / 3.0).min(1.0) * moved } else { moved };
         let external = External {
             sequence,
             status: if valid { status::VALID } else { 0 } | if contact { status::CONTACT } else { 0 },
             torque,
-            torque_std: (around + white).sqrt(),
+            torque_std: (around + white + moved * moved).sqrt(),
             link_torque: self.measured[0] - own,
             difference: sum - self.measured[0],
         };

@@ -251,24 +251,21 @@ impl ModelMonitor {
         let Some(corrected) = self.effects.corrections.correct(sample, !goes_on) else {
             return self.alarm;
         };
-        let mut now = self.inputs_of(&corrected.aligned);
+        let now = self.inputs_of(&corrected.aligned);
         if std::mem::take(&mut self.begins) {
             self.restart(&now);
             return self.alarm;
         }
-        let (from, acted) = (self.inputs, self.torque);
-        for k in 1..periods {
-            let share = k as f64 / periods as f64;
-            let mut between: [f64; CHANNELS] = std::array::from_fn(|c| from[c] + share * (now[c] - from[c]));
-            between[TORQUE..LINK].copy_from_slice(&acted);
-            self.advance(&between);
+        // A torque acts from its sample to the next: around a moment it is half the old, half the new one.
+        let mut from = self.inputs;
+        from[TORQUE..LINK].copy_from_slice(&self.torque);
+        for k in 1..=periods {
+            let share = |ago: f64| (k as f64 - ago) / periods as f64;
+            let at = |c: usize, share: f64| (1.0 - share) * from[c] + share * now[c];
+            let torque = TORQUE..LINK;
+            self.advance(&std::array::from_fn(|c| at(c, share(if torque.contains(&c) { 0.5 } else { 0.0 }))));
         }
-        // A torque acts from its sample to the next: around this moment it is half the old, half the new one.
-        for i in 0..MOTORS {
-            self.torque[i] = now[TORQUE + i];
-            now[TORQUE + i] = 0.5 * (acted[i] + now[TORQUE + i]);
-        }
-        self.advance(&now);
+        self.torque.copy_from_slice(&now[TORQUE..LINK]);
         self.alarm
     }
 

@@ -166,7 +166,7 @@ impl Robust {
         if self.sides.iter().all(Side::knows_nothing) {
             return self.reset(); // as at a start: the zeros are those that are declared
         }
-        self.validator.reset();
+        self.validator.lose_zeros();
         self.corrections.reset();
         self.momentum.iter_mut().for_each(LinkMomentum::reset);
         (self.live.begins, self.live.zeros_known, self.live.jumped) = (true, false, None);

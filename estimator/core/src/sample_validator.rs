@@ -151,6 +151,13 @@ impl SampleValidator {
         self.trail.iter_mut().for_each(|places| *places = [f64::NAN; PLACES]);
     }
 
+    /// Positions may count from anywhere after this; torques are as before.
+    pub fn lose_zeros(&mut self) {
+        let Memory { torque, largest, .. } = self.memory;
+        self.reset();
+        (self.memory.torque, self.memory.largest) = (torque, largest);
+    }
+
     /// Smallest change of each position (motors, then the link) or of its changes: its resolution, rad; ∞ before any.
     #[must_use]
     pub fn resolution(&self) -> &[f64; PLACES] {
@@ -272,7 +279,8 @@ impl SampleValidator {
             if size >= self.tame[i].max(FAR * m.largest[i]) {
                 m.wild += 1;
                 if m.wild < self.patience || size > ABSURD * self.tame[i] {
-                    self.found = Some((Signal::MotorTorque(i), Reason::Jumped));
+                    let jumps = m.largest[i] > 0.0; // a joint may be in motion when it is seen first
+                    self.found = jumps.then_some((Signal::MotorTorque(i), Reason::Jumped)).or(self.found);
                     return true;
                 }
             }

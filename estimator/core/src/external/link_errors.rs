@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{MEMORY_S, TINY};
-use crate::choices::{ONE_WAY, SLOW};
+use crate::choices::{ONE_WAY, SLOW, SLOW_S};
 use crate::model::Link;
 
 const PARAMETERS: usize = 6;
@@ -15,7 +15,8 @@ pub(super) const DRY: usize = 3;
 ///
 /// Parameters: a constant torque, inertia, viscous damping, dry friction, gravity's sine and cosine. The
 /// declared uncertainties are the priors. Recursive least squares with exponential forgetting in information
-/// form: Λ = Λ₀ + Σ e^(−t/20 s) x xᵀ/r.
+/// form, Λ = Λ₀ + Σ e^(−t/25 s) x xᵀ/r, each balance with the weight of Student's distribution: what is left of a push
+/// has little.
 ///
 /// The constant may be a push: it is identified with a flat prior so that the others have to explain what varies
 /// with the motion, and it is not taken off: a load on a link at rest is no gravity. Of a link that turns one way
@@ -28,6 +29,9 @@ pub(super) struct LinkErrors {
     vector: [f64; PARAMETERS],
     fastest: f64,
     direction: Option<f64>, // its mean over the memory: ±1 one way only, 0 to and fro
+    whole: f64,             // what all parameters make of the last row, the constant too
+    left: Option<f64>,      // mean square of what they leave of late, (N·m)², pushes apart …
+    unexplained: f64,       // … and the share of the time for which that is not what is expected
 }
 
 pub(super) type Row = [f64; PARAMETERS];
@@ -49,8 +53,30 @@ impl LinkErrors {
         self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
     }
 
-    /// The torque that these errors make, and its variance.
-    pub(super) fn at(&self, row: &Row, prior: &Row) -> (f64, f64) {
+    /// The torque that these errors make, and its variance: as identified, and as before any data.
+    ///
+    /// Torques of a hand that guides the link are as smooth as errors of the link. What was identified is believed where
+    /// it explains the balance for more than half of the time; pushes are shorter.
+    pub(super) fn at(&mut self, row: &Row, prior: &Row) -> (f64, f64) {
+        let (torque, variance) = self.identified(row, prior);
+        let before: f64 = (CONSTANT + 1..PARAMETERS).map(|i| row[i] * row[i] * prior[i]).sum();
+        let believed = (2.0 * (1.0 - self.unexplained)).min(1.0);
+        let between = believed * (1.0 - believed) * torque * torque;
+        (believed * torque, believed * variance + (1.0 - believed) * before + between)
+    }
+
+    /// How much noisier a balance seems than expected, 1 or more, by what is left of it; `expected`: its variance.
+    pub(super) fn doubt(&mut self, left: f64, expected: f64, period_s: f64) -> f64 {
+        let square = (left - self.whole).powi(2);
+        let doubt = 1.0 + square / expected.max(TINY * TINY);
+        let gain = period_s / SLOW_S;
+        self.unexplained += gain * (1.0 - doubt.recip() - self.unexplained);
+        let before = self.left.unwrap_or(expected);
+        self.left = Some(before + gain * (square / doubt - before));
+        doubt
+    }
+
+    fn identified(&mut self, row: &Row, prior: &Row) -> (f64, f64) {
         let mut factor = self.information;
         let least = prior.map(|variance| if variance > 0.0 { 1.0 / variance } else { 1.0 });
         for i in 0..PARAMETERS {
@@ -60,7 +86,9 @@ impl LinkErrors {
         let mut own = *row;
         own[CONSTANT] = 0.0;
         let mut vector = self.vector;
-        let (mut torque, mut variance) = (0.0, 0.0);
+        let (mut torque, mut variance, mut level) = (0.0, 0.0, [0.0; PARAMETERS]);
+        level[CONSTANT] = row[CONSTANT];
+        self.whole = 0.0;
         for i in 0..PARAMETERS {
             for j in 0..=i {
                 let sum: f64 = (0..j).map(|k| factor[i][k] * factor[j][k]).sum();
@@ -70,14 +98,22 @@ impl LinkErrors {
             }
             for k in 0..i {
                 own[i] -= factor[i][k] * own[k];
+                level[i] -= factor[i][k] * level[k];
                 vector[i] -= factor[i][k] * vector[k];
             }
             own[i] /= factor[i][i];
+            level[i] /= factor[i][i];
             vector[i] /= factor[i][i];
             torque += own[i] * vector[i];
+            self.whole += (own[i] + level[i]) * vector[i];
             variance += own[i] * own[i];
         }
         (torque, variance)
+    }
+
+    /// Mean square of what these errors leave of late, (N·m)².
+    pub(super) fn left(&self) -> f64 {
+        self.left.unwrap_or(0.0)
     }
 
     /// What the declared link leaves of one balance; `noise`: its variance, as if errors were independent.

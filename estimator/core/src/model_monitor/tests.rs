@@ -124,6 +124,20 @@ fn the_rate_of_false_alarms_is_the_declared_one() {
 }
 
 #[test]
+fn samples_that_are_lost_leave_hardly_more_than_none() {
+    // The torque changes by 0.7 N·m in two periods: held over them, it would leave a hundred times as much.
+    let left = |lost: fn(u64) -> bool| {
+        let mut monitor = monitor(Vec::new());
+        (0..4000).filter(|k| !lost(*k)).for_each(|k| {
+            monitor.step(&sample(k, [0.0; 3]));
+        });
+        monitor.found().residual[0]
+    };
+    let (none, some) = (left(|_| false), left(|k| k % 5 == 3 || k % 5 == 4));
+    assert!(some < none + 0.01, "{some} beside {none}");
+}
+
+#[test]
 fn gaps_are_bridged_or_begin_anew_and_what_is_no_measurement_is_passed_over() {
     let mut monitor = monitor(Vec::new());
     for k in (0..4000).filter(|k| k % 10 != 3 && k % 10 != 4) {

@@ -215,18 +215,20 @@ class Balance:
         return both / own if agree else None
 
     def controlled(self) -> FloatArray:
-        """Fit a controller that makes the torque from the motor's own reading: PID of any delay.
+        """Fit a controller that makes the torque from the motor's own reading: PID of any delay, and what
+        compensates gravity, any curve of the position.
 
-        No gain is negative. Where it leaves no more than the joint does, the torque says what the controller
-        does, not what the joint is (closed-loop identification without excitation of its own: Ljung, System
-        Identification, 1999, section 13.4).
+        No gain but the curve's is negative. Where it leaves no more than the joint does, the torque says what
+        the controller does, not what the joint is (closed-loop identification without excitation of its own:
+        Ljung, System Identification, 1999, section 13.4).
 
         Returns:
             (bands,) residual rms over the rms of the whole torque, at least `gate_floor`.
         """
         position, integral = (self._through(x)[0] for x in (self._theta, np.cumsum(self._theta)))
-        factors = _factors([position, integral, self._velocity, self._rate], self._target)
-        _, left = _bounded(factors, (-1.0, -1.0, -1.0, 0.0))
+        curve = [position, *self._position]
+        factors = _factors([integral, self._velocity, self._rate, *curve], self._target)
+        _, left = _bounded(factors, (-1.0, -1.0, 0.0, *[0.0] * len(curve)))
         return np.asarray(np.hypot(left[:-1], choice("gate_floor")))
 
     @property

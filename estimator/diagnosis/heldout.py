@@ -147,12 +147,15 @@ class Held:
         return min(fall, _in_errors(self.scores(found, both) - self.scores(rest, both)))
 
     def _preferred(self, found: Fitted, models: Sequence[Fitted]) -> list[bool]:
-        """Whether each says more of the phenomena of the one found and held-out data ask for it, be it for
-        less than laws leave anyway; none that they tell from the best of these.
+        """Whether each says more of the phenomena of the one found and held-out data ask for it, by more than it
+        costs, be it for less than laws leave anyway; none that they tell from the best of these.
         """
+        errors = self._independent(found)
 
         def beats(one: Fitted, other: Fitted) -> bool:
-            return _in_errors(self.scores(one) - self.scores(other)) > 1.0
+            gain = self.scores(one) - self.scores(other)
+            cost = other.log_prior(errors, self.price) - one.log_prior(errors, self.price)
+            return _in_errors(gain) > 1.0 and errors * float(np.mean(gain)) > cost
 
         richer = [one for one in models if _refines(one, found) and beats(one, found)]
         best = max(richer, key=lambda one: float(np.mean(self.scores(one))), default=found)

@@ -147,8 +147,8 @@ class Held:
         return min(fall, _in_errors(self.scores(found, both) - self.scores(rest, both)))
 
     def _preferred(self, found: Fitted, models: Sequence[Fitted]) -> list[bool]:
-        """Whether each says more of the phenomena of the one found and held-out data ask for it, by more than it
-        costs, be it for less than laws leave anyway; none that they tell from the best of these.
+        """Whether each says more of the phenomena of the one found and held-out data ask for it, for more
+        than it costs, be it for less than laws leave anyway; none that they tell from the best of these.
         """
         errors = self._independent(found)
 

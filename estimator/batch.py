@@ -347,10 +347,8 @@ def _spring_covariances(joint: JointFit) -> list[FloatArray]:
     made = []
     for i in range(len(problem.model.motors)):
         mine = _spring_columns(fitted, i)
-        own = joint.covariance
-        if mine:
-            own = own + search.unseen(fitted, mine[0], float(effects[mine[0]]))
-        made.append(own[np.ix_(mine, mine)])
+        more = search.unseen(fitted, mine[0], float(effects[mine[0]])) if mine else 0.0
+        made.append((joint.covariance + more)[np.ix_(mine, mine)])
     return made
 
 

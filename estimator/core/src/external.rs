@@ -277,6 +277,14 @@ impl LinkMomentum {
         }
     }
 
+    /// What the declared link leaves of one balance; variances that the curve and the readings give it.
+    fn learn(&mut self, row: &link_errors::Row, left: f64, curve: f64, readings: f64) {
+        let doubt = self.errors.doubt(left, curve + readings, self.period);
+        // Errors of readings last as long as the filter does, what the model leaves as long as a motion.
+        let lasting = (readings / self.filter.bandwidth).max(self.errors.left() * MEAN_S);
+        self.errors.identify(row, left, doubt * lasting / self.period);
+    }
+
     /// What is published of a sample that was used.
     ///
     /// `valid`: whether the estimate is; `noise`: variance of q's noise, rad².
@@ -314,13 +322,8 @@ impl LinkMomentum {
         let (torque, contact) = self.judge.judge(sum - off, self.carried[0], around, white, valid);
         let usual = torque.abs() <= SURE * (around + white).sqrt();
         if valid && usual && !contact {
-            // Errors of readings last as long as the filter does, what the model leaves as long as a motion.
-            let (curve, readings) =
-                (carried.variance + (LINK_FLOOR * self.judge.largest).powi(2), read + white + late);
-            let left = sum - self.measured[0];
-            let doubt = self.errors.doubt(left, curve + readings, self.period);
-            let lasting = (readings / self.filter.bandwidth).max(self.errors.left() * MEAN_S);
-            self.errors.identify(&row, left, doubt * lasting / self.period);
+            let curve = carried.variance + (LINK_FLOOR * self.judge.largest).powi(2);
+            self.learn(&row, sum - self.measured[0], curve, read + white + late);
         }
         // What it has changed by over the filter's delay, it may have changed by since.
         let moved = torque - self.trailing;

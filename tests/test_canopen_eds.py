@@ -1,12 +1,14 @@
-"""Data sheets as they are found. The makers' own files are used where they are at hand, never shipped."""
+"""Data sheets as they are found, and what lely-core answered with two of them. The makers' own files are never shipped."""
 
 import os
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
 from canopen.objectdictionary import datatypes
-from canopenkit import Slave, Wire, configure, eds_text, joint_text, sheet_objects
+from canopenkit import Slave, Wire, configure, configured, eds_text, joint_text, sheet_objects
 
+from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.layout import Signal
 from drivelink.canopen.pdo import describe
@@ -178,3 +180,42 @@ def test_compact_arrays_and_numbers_without_end_are_bounded(tmp_path):
         found = sheet(tmp_path, MINIMAL.replace("-5", number))
         assert found.value(0x6064) is None
         assert "6064:00 has a value that is not a number" in found.problems[0]
+
+
+TRANSCRIPTS = Path(__file__).parent / "transcripts/lely"
+COUNTS, TORQUE_COUNTS = 123_456, -321  # that it measured at its SYNC
+TO_LELY = "counts_per_rev = 4096\nrated_torque_nm = 1.0\nrated_current_a = 1.0\ntorque_constant_nm_a = 0.1"
+
+
+class RecordedSlave:
+    """A node that answers each request as it once did, and is asked everything that it was asked then."""
+
+    def __init__(self, maker: str) -> None:
+        self.left: dict[str, list[list[str]]] = defaultdict(list)
+        for line in (TRANSCRIPTS / f"{maker}.txt").read_text(encoding="utf-8").splitlines()[1:]:
+            if line.startswith(">"):
+                self.left[line].append(answers := [])
+            else:
+                answers.append(line)
+
+    def handle(self, cob_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        """A frame in, and what was answered."""
+        answers = self.left[f"> {cob_id:03X} {data.hex(' ').upper()}".rstrip()].pop(0)
+        return [(int(line[2:5], 16), bytes.fromhex(line[6:])) for line in answers]
+
+
+@pytest.mark.parametrize("maker", ["epos4", "nanotec"])
+def test_what_lely_core_answered_is_configured_and_decoded(maker):
+    slave = RecordedSlave(maker)
+    _, layout = configured(slave, joint_text(drive=TO_LELY))
+    assembler = Assembler((layout,), 1)
+    assembler.feed(SYNC_COB_ID, b"")
+    (sample,) = [assembler.feed(*answer) for answer in slave.handle(SYNC_COB_ID, b"")]
+    assert not any(slave.left.values())
+    scales = {str(o.signal): o.scale for tpdo in layout.tpdos for o in tpdo.objects}
+    counts = (
+        sample.motor_position_rad[0] / scales["motor_position"],
+        sample.motor_torque_nm[0] / scales["motor_torque"],
+    )
+    assert counts == pytest.approx((COUNTS, TORQUE_COUNTS))
+    assert {f"{o.index:04X}" for tpdo in layout.tpdos for o in tpdo.objects} == {"6064", "6077", "6041"}

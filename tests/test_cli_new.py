@@ -1,13 +1,12 @@
 import io
 
-import can
 import pytest
+from daemonkit import served
 
 from drivelink import jointfile
 from drivelink.canopen.newfile import Answers, answers_from_bus, joint_text
 from drivelink.canopen.scan import FoundNode
 from drivelink.cli import main
-from drivelink.demo.simulate import network_from_joint
 from drivelink.errors import DriveError
 
 
@@ -118,13 +117,8 @@ def test_questions_left_unanswered_are_one_line(tmp_path, monkeypatch, capsys):
 def test_the_bus_is_asked_who_is_there(tmp_path, request):
     channel = request.node.name
     described = made(tmp_path, "--case", "vsa-ii", "--channel", channel, name="sim.toml")
-    with can.Bus(interface="virtual", channel=channel) as bus:
-        network = network_from_joint(described, bus)
-        network.start()
-        try:
-            joint = made(tmp_path, "--scan", "--interface", "virtual", "--channel", channel)
-        finally:
-            network.stop()
+    with served(described):
+        joint = made(tmp_path, "--scan", "--interface", "virtual", "--channel", channel)
     assert joint.arrangement == "antagonistic"
     assert [motor.drive.node_id for motor in joint.motor] == [1, 2]
     assert joint.link.encoder.node_id == 10

@@ -4,11 +4,10 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from zenohkit import make_estimate, make_external
+from zenohkit import make_estimate, make_external, python
 
 from drivelink._core import encode_estimate, encode_external
 
@@ -39,13 +38,8 @@ def run(*command, **options):
     ],
 )
 def test_the_python_examples_run(daemon, name, expected, more):
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
-    command = [sys.executable, str(EXAMPLES / name), "elbow", daemon, more]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
-        try:
-            assert any(re.search(expected, line) for line in process.stdout)
-        finally:
-            process.kill()
+    with python(EXAMPLES / name, "elbow", daemon, more) as process:
+        assert any(re.search(expected, line) for line in process.stdout)
 
 
 @pytest.mark.rust

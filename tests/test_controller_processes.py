@@ -13,7 +13,7 @@ import threading
 
 import controllerkit as kit
 import pytest
-from zenohkit import free_endpoint, free_port, process, until
+from zenohkit import free_endpoint, free_port, process, python, until
 
 
 def reaches(events: list[dict], phase: str, after: int = 0) -> dict:
@@ -40,23 +40,10 @@ def test_a_killed_daemon_and_the_way_back_in_three_processes(tmp_path):
     path = tmp_path / "vsa.toml"
     path.write_text(f"{head}{bus}[estimator]{rest.partition('[estimator]')[2]}", encoding="utf-8")
     # The example's own 10 ms belong to a machine of its own: here others may hold a core for longer.
-    command = [
-        sys.executable,
-        str(kit.EXAMPLE / "run.py"),
-        str(path),
-        "--identify",
-        "1",
-        "--deadline",
-        "0.08",
-    ]
-    with process("sim", str(path)) as drives:
+    options = ("--identify", "1", "--deadline", "0.08")
+    with process("sim", path) as drives:
         assert "ready" in drives.stdout.readline()
-        with (
-            process("run", str(path)) as daemon,
-            subprocess.Popen(
-                command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-            ) as controller,
-        ):
+        with process("run", path) as daemon, python(kit.EXAMPLE / "run.py", path, *options) as controller:
             events: list[dict] = []
             reader = threading.Thread(target=lambda: events.extend(map(json.loads, controller.stdout)))
             reader.start()
@@ -65,7 +52,7 @@ def test_a_killed_daemon_and_the_way_back_in_three_processes(tmp_path):
                 before = len(events)
                 daemon.kill()
                 assert reaches(events, "safe", before)["reason"] == "estimates are stale"
-                with process("run", str(path)):
+                with process("run", path):
                     reaches(events, "identify", before)
                     controller.send_signal(signal.SIGTERM)
                     assert controller.wait(60.0) == 0

@@ -65,11 +65,8 @@ endpoint = "{free_endpoint()}"
 def rig():
     """A simulated drive and encoder, served by a thread on a virtual bus."""
     channel = f"doctor-{next(CHANNELS)}"
-    with can.Bus(interface="virtual", channel=channel) as bus:
-        network = network_from_joint(parse(joint_on(channel)), bus)
-        network.start()
+    with daemonkit.served(parse(joint_on(channel))):
         yield channel
-        network.stop()
 
 
 def texts(report, severity=None):

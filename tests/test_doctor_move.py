@@ -9,12 +9,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-import can
 import pytest
+from daemonkit import served
 
 from drivelink.canopen.layout import Signal
 from drivelink.cli import main
-from drivelink.demo.simulate import network_from_joint
 from drivelink.doctor.livevalues import LiveValues, Readings, Series
 from drivelink.doctor.manualcheck import ByHand, Value, check_by_hand
 from drivelink.jointfile import JointFile, load, parse
@@ -214,11 +213,8 @@ def bench(tmp_path: Path) -> Iterator[Path]:
     path.write_text(
         f'{text}\n[link.dynamics]\ninertia_kg_m2 = 0.2\n[sim.excitation]\nkind = "none"\n[bus]\nchannel = "{channel}"\n'
     )
-    with can.Bus(interface="virtual", channel=channel) as bus:
-        network = network_from_joint(load(path), bus)
-        network.start()
+    with served(load(path)):
         yield path
-        network.stop()
 
 
 @contextmanager

@@ -199,13 +199,8 @@ def test_sparkline_and_plot_take_anything_and_are_never_wider_than_their_room():
 
 def printed(wanted, *arguments):
     """The first line that `drivelink monitor` prints of which this is true."""
-    command = [sys.executable, "-m", "drivelink", "monitor", "--every", "0.2", *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            return next(filter(wanted, process.stdout))
-        finally:
-            process.kill()
+    with zenohkit.process("monitor", "--every", "0.2", *arguments) as process:
+        return next(filter(wanted, process.stdout))
 
 
 def test_without_a_terminal_monitor_prints_plain_or_json_lines(daemon):

@@ -1,6 +1,8 @@
-"""The world in lockstep: periods, set-points, rows, determinism; and the paper's three cases."""
+"""The world in lockstep: periods, set-points, determinism, the paper's cases; sensors; torque profiles of the rig."""
 
 import math
+from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -9,9 +11,9 @@ from simjoints import EXCITATION, HARDENING, LINEAR, PERFECT, PERFECT_ENCODER, R
 from sim.cases import case
 from sim.effects import parse
 from sim.errors import SimError
-from sim.excitation import build
-from sim.sensors import DriveHardware
-from sim.variation import with_parameters
+from sim.excitation import KINDS, build
+from sim.sensors import DriveHardware, LinkEncoder, noise
+from sim.variation import suitable, with_parameters
 from sim.world import World, record
 
 NOISY = DriveHardware(gear_ratio=50.0, current_noise_a=0.01)
@@ -160,3 +162,174 @@ def test_vsa_ii_has_the_papers_springs_two_sines_and_the_deflections_that_its_po
         found = 1000.0 * np.linalg.lstsq(powers, torque, rcond=None)[0]
         # Printed: 140.62, 112.8, 73.2 .. 73.9; the higher ones depend on the range.
         assert found[:3] == pytest.approx([140.625, 112.75, 73.6], rel=0.015)
+
+
+DRIVE = DriveHardware(
+    counts_per_rev=4096.0,
+    gear_ratio=50.0,
+    torque_constant_nm_a=0.05,
+    rated_current_a=4.0,
+    current_noise_a=0.01,
+)
+
+
+def recorded(drive, encoder=PERFECT_ENCODER, **kwargs):
+    return record(World(sea(), (drive,), encoder, excitation=build(EXCITATION, 1), **kwargs), 3.0)
+
+
+def test_positions_are_whole_counts_of_the_motor_shaft():
+    r = recorded(DRIVE)
+    step = 2.0 * math.pi / (4096 * 50)
+    counts = r["motor1_position_rad"] / step
+    assert counts == pytest.approx(np.round(counts), abs=1e-6)
+    error = r["motor1_position_rad"] - r["truth_motor1_position_rad"]
+    assert np.abs(error).max() <= step / 2 * (1 + 1e-9)
+    assert np.std(error) == pytest.approx(step / math.sqrt(12.0), rel=0.05)  # uniform within a count
+
+
+def test_velocity_comes_in_whole_revolutions_per_minute():
+    r = recorded(DRIVE)
+    rpm = r["motor1_velocity_rad_s"] * 50.0 * 60.0 / (2.0 * math.pi)
+    assert rpm == pytest.approx(np.round(rpm), abs=1e-9)
+    assert np.abs(r["motor1_velocity_rad_s"] - r["truth_motor1_velocity_rad_s"]).max() < 0.11 / 50.0
+
+
+def test_current_is_noisy_and_comes_in_per_mille_of_the_rated_current():
+    r = recorded(DRIVE)
+    permille = r["motor1_current_a"] / 0.004
+    assert permille == pytest.approx(np.round(permille), abs=1e-6)
+    error = r["motor1_torque_nm"] - r["truth_motor1_torque_nm"]
+    per_ampere = 0.05 * 50.0
+    # Noise of 10 mA and a step of 4 mA add as squares; 3000 draws give it to 1.3 %.
+    assert np.std(error) == pytest.approx(per_ampere * math.hypot(0.01, 0.004 / math.sqrt(12.0)), rel=0.05)
+    assert r["motor1_torque_nm"] == pytest.approx(r["motor1_current_a"] * per_ampere)
+
+
+def test_directions_turn_what_is_reported_and_not_what_happens():
+    plain = recorded(DRIVE)
+    turned = recorded(replace(DRIVE, direction=-1), replace(PERFECT_ENCODER, direction=-1))
+    for name in ("truth_link_position_rad", "truth_motor1_torque_nm"):
+        assert turned[name] == pytest.approx(plain[name])
+    world = World(sea(), (replace(DRIVE, direction=-1),), LinkEncoder(direction=-1), initial_rad=(0.1, 0.2))
+    assert world.drive(0).position_counts == -round(0.2 * 4096 * 50 / (2 * math.pi))
+    assert world.link_counts() == -round(0.1 * 262144 / (2 * math.pi))
+    world.command(0, 0.1)
+    world.advance()
+    assert world.truth().motors[0].torque_nm == pytest.approx(-0.1 * 50)
+    opposite = World(sea(), (replace(DRIVE, torque_direction=-1),))
+    opposite.command(0, 0.1)
+    opposite.advance()
+    assert opposite.truth().motors[0].torque_nm == pytest.approx(-5.0)
+
+
+def test_the_drive_limits_its_current():
+    world = World(sea(), (DRIVE,))
+    world.command(0, 100.0)
+    world.advance()
+    assert world.truth().motors[0].torque_nm == pytest.approx(3.0 * 4.0 * 0.05 * 50.0)
+
+
+def test_the_link_encoder_has_its_counts_zero_and_noise():
+    encoder = LinkEncoder(counts_per_rev=65536.0, zero_rad=0.5, noise_counts=2.0)
+    r = recorded(DRIVE, encoder)
+    step = 2.0 * math.pi / 65536.0
+    error = (r["link_position_rad"] - r["truth_link_position_rad"]) / step
+    assert np.std(error) == pytest.approx(math.hypot(2.0, 1.0 / math.sqrt(12.0)), rel=0.05)
+    assert World(sea(), (DRIVE,), encoder).link_counts() == pytest.approx(-65536 * 0.5 / (2 * math.pi), abs=8)
+
+
+def test_noise_is_the_same_for_the_same_seed_and_else_another():
+    assert list(islice(noise((1, 2), 1.0), 5000)) == list(islice(noise((1, 2), 1.0), 5000))
+    assert list(islice(noise((1, 2), 1.0), 5)) != list(islice(noise((2, 2), 1.0), 5))
+    assert list(islice(noise((1,), 0.0), 3)) == [0.0] * 3
+
+
+@pytest.mark.parametrize(
+    ("kind", "key", "value"),
+    [
+        (DriveHardware, "counts_per_rev", 0.0),
+        (DriveHardware, "gear_ratio", -1.0),
+        (DriveHardware, "rated_current_a", math.nan),
+        (DriveHardware, "max_current_a", 0.0),
+        (DriveHardware, "current_noise_a", -1.0),
+        (DriveHardware, "direction", 0),
+        (LinkEncoder, "counts_per_rev", 0.0),
+        (LinkEncoder, "direction", 2),
+    ],
+)
+def test_impossible_hardware_is_one_clear_line(kind, key, value):
+    with pytest.raises(SimError, match=f"^{key}: expected "):
+        kind(**{key: value})
+
+
+REQUIRED = {"sines": {"frequency_hz": 0.5}}
+
+
+def profile(table, seconds=20.0, motors=1, motor=0):
+    excitation = build(table, motors)
+    return np.array([excitation.torque(motor, t, 0.0, 0.0) for t in np.arange(0.0, seconds, 0.01)])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_keeps_to_its_amplitude_and_repeats(kind):
+    table = {"kind": kind, "amplitude_nm": 2.0, **REQUIRED.get(kind, {})}
+    torque = profile(table)
+    assert np.abs(torque).max() <= 2.0 * 4.3  # a sum of 12 tones of one sine's rms, all at their peak
+    assert (np.std(torque) > 0.5) == (kind != "none")
+    assert np.array_equal(torque, profile(table))
+
+
+@pytest.mark.parametrize("kind", ["multisine", "steps", "rich"])
+def test_motors_move_differently_and_another_seed_is_another_motion(kind):
+    table = {"kind": kind, "amplitude_nm": 1.0}
+    one, two = profile(table, motors=2), profile(table, motors=2, motor=1)
+    assert abs(np.corrcoef(one, two)[0, 1]) < 0.5
+    assert not np.allclose(one, profile(table | {"seed": 1}, motors=2))
+
+
+def test_offset_ramp_and_hold():
+    torque = profile({"kind": "none", "offset_nm": 3.0, "ramp_s": 2.0}, 4.0)
+    assert torque[:201] == pytest.approx(np.linspace(0.0, 3.0, 201))
+    assert torque[201:] == pytest.approx(3.0)
+    table = {"kind": "none", "centre_rad": [0.1, -0.1], "centring_nm_rad": 10.0, "centring_nm_s_rad": 2.0}
+    excitation = build(table, 2)
+    assert excitation.torque(0, 0.0, 0.3, 0.5) == pytest.approx(-10.0 * 0.2 - 1.0)
+    assert excitation.torque(1, 0.0, -0.1, 0.0) == pytest.approx(0.0)
+
+
+def test_an_external_torque_acts_on_the_link_and_is_recorded():
+    table = {"kind": "none", "external": {"kind": "sines", "amplitude_nm": 2.0, "frequency_hz": 0.5}}
+    r = record(World(sea(gravity=0.0), (PERFECT,), excitation=build(table, 1)), 1.0)
+    assert r["external_torque_nm"] == pytest.approx(2.0 * np.sin(np.pi * r["time_s"]))
+    assert r["truth_link_position_rad"][-1] > 0.1
+
+
+@pytest.mark.parametrize("motors", [1, 2])
+def test_a_suitable_torque_moves_any_joint_within_bounds(motors):
+    plant = sea(motors=motors)
+    r = record(World(plant, (PERFECT,) * motors, excitation=build(suitable(plant), motors)), 10.0)
+    assert 0.1 < np.ptp(r["truth_motor1_position_rad"]) < 3.0
+    assert np.std(r["truth_motor1_deflection_rad"]) > 0.005
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"kind": "square"}, "excitation.kind: expected one of none, sines"),
+        ({"kind": "sines", "amplitude_nm": 1.0}, "excitation.frequency_hz: expected this key"),
+        ({"kind": "multisine"}, "excitation.amplitude_nm: expected this key"),
+        ({"kind": "none", "amplitude": 1.0}, "excitation.amplitude: unknown key"),
+        ({"kind": "chirp", "amplitude_nm": "1"}, "expected a finite number, got '1'"),
+        ({"kind": "chirp", "amplitude_nm": True}, "expected a finite number, got True"),
+        ({"kind": "chirp", "amplitude_nm": 1.0, "low_hz": 5.0, "high_hz": 1.0}, "0 < low_hz < high_hz"),
+        ({"kind": "multisine", "amplitude_nm": 1.0, "tones": 2.5}, "tones: expected a whole number"),
+        ({"kind": "steps", "amplitude_nm": 1.0, "hold_s": 0.0}, "hold_s: expected a number >= 0.001"),
+        ({"kind": "none", "external": 3.0}, "excitation.external: expected a table"),
+        ({"kind": "none", "external": {"kind": "sines"}}, r"excitation.external.amplitude_nm: expected"),
+        ({"kind": "steps", "amplitude_nm": [1.0, 2.0]}, r"amplitude_nm: expected 1 number\(s\), got 2"),
+    ],
+)
+def test_a_wrong_table_is_one_clear_line(table, message):
+    with pytest.raises(SimError, match=message) as caught:
+        build(table, 1)
+    assert "\n" not in str(caught.value)

@@ -1,20 +1,17 @@
 """The daemon on a real SocketCAN: kernel stamps, filters, CAN FD, interface away and back, three processes, foreign peers."""
 
-import os
 import re
 import signal
 import struct
 import subprocess
-import sys
 import time
 from contextlib import contextmanager
-from pathlib import Path
 
 import can
 import canopen
 import pytest
 from daemonkit import vsa_text
-from zenohkit import LIMIT_S, free_endpoint, until
+from zenohkit import LIMIT_S, free_endpoint, process, until
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.bus import interface_is_up, open_bus
@@ -29,7 +26,6 @@ pytestmark = [
     pytest.mark.socketcan,
     pytest.mark.skipif(not interface_is_up(CHANNEL), reason="no SocketCAN interface vcan0 here"),
 ]
-REPOSITORY = Path(__file__).parents[2]
 
 
 def ip(*arguments):
@@ -111,32 +107,20 @@ def test_an_interface_that_goes_down_is_a_lost_bus():
 
 
 def test_drives_daemon_and_subscriber_are_three_processes(tmp_path):
-    path, endpoint, started = tmp_path / "elbow.toml", free_endpoint(), []
+    path, endpoint = tmp_path / "elbow.toml", free_endpoint()
     bus = 'interface = "socketcan"\nperiod_s = 0.004'
     path.write_text(vsa_text(channel=CHANNEL, endpoint=endpoint, bus=bus), encoding="utf-8")
-    how = {
-        "stdout": -1,
-        "stderr": -1,
-        "text": True,
-        "cwd": REPOSITORY,
-        "env": os.environ | {"PYTHONUNBUFFERED": "1"},
-    }
-    try:
-        for verb in ("sim", "run"):
-            started.append(subprocess.Popen([sys.executable, "-m", "drivelink", verb, str(path)], **how))
-            assert "ready" in started[-1].stdout.readline(), started[-1].stderr.read()
-        daemon = started[1]
-        with subscribe("elbow", endpoint=endpoint) as client:
-            until(lambda: (e := client.wait(timeout_s=1.0)) and not e.status & Status.STALE)
-        daemon.send_signal(signal.SIGTERM)
-        out, err = daemon.communicate(timeout=LIMIT_S)
-        assert daemon.returncode == 0, err
-        cycles, _missed = map(int, re.search(r"(\d+) cycles, (\d+) missed", out).groups())
-        assert cycles > 0  # how many a loaded machine misses says nothing of the interface
-    finally:
-        for process in started:
-            process.kill()
-            process.communicate()
+    with process("sim", path) as drives:
+        assert "ready" in drives.stdout.readline()
+        with process("run", path) as daemon:
+            assert "ready" in daemon.stdout.readline(), daemon.stderr.read()
+            with subscribe("elbow", endpoint=endpoint) as client:
+                until(lambda: (e := client.wait(timeout_s=1.0)) and not e.status & Status.STALE)
+            daemon.send_signal(signal.SIGTERM)
+            out, err = daemon.communicate(timeout=LIMIT_S)
+    assert daemon.returncode == 0, err
+    cycles, _missed = map(int, re.search(r"(\d+) cycles, (\d+) missed", out).groups())
+    assert cycles > 0  # how many a loaded machine misses says nothing of the interface
 
 
 def test_the_receive_buffer_holds_a_long_stall():

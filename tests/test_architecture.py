@@ -21,15 +21,16 @@ CLOCKS_AND_IO = {
 
 
 @cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
+def nodes_of(path: Path) -> list[ast.AST]:
+    """All of a module's syntax tree."""
+    return [*ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
 
 
 @cache
 def imports(path: Path) -> set[str]:
     """Top-level names of the packages that a module imports, wherever in the file."""
     found: set[str] = set()
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             found |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -50,7 +51,7 @@ def test_the_package_imports_nothing_beyond_what_it_may(package):
         assert imports(path) <= ALLOWED[package], f"{path.relative_to(ROOT)}"
         if package == "estimator":  # reads no clock and touches no file or socket
             assert not imports(path) & CLOCKS_AND_IO, f"{path.relative_to(ROOT)}"
-            calls = (node.func for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call))
+            calls = (node.func for node in nodes_of(path) if isinstance(node, ast.Call))
             names = {func.id for func in calls if isinstance(func, ast.Name)}
             assert not names & {"open", "print", "input"}, f"{path.relative_to(ROOT)}"
 
@@ -82,15 +83,14 @@ def test_the_service_reaches_the_simulated_world_in_one_place_only():
 
 def _modules_imported(path: Path) -> set[str]:
     """Full names of the modules that a module imports at run time, wherever in the file."""
-    tree = tree_of(path)
     typing_only = {
         id(inner)
-        for node in ast.walk(tree)
+        for node in nodes_of(path)
         if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
         for inner in ast.walk(node)
     }
     found: set[str] = set()
-    for node in ast.walk(tree):
+    for node in nodes_of(path):
         if id(node) in typing_only:
             continue
         if isinstance(node, ast.ImportFrom) and node.module:

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 
 import pytest
 import zenohkit
-from daemonkit import vsa_text
+from daemonkit import served, vsa_text
 from mcap.reader import make_reader
 from test_recording_recorder import joint_file
 
@@ -138,10 +138,11 @@ def test_events_of_the_status_are_kept(status, cause, tmp_path):
     assert [made[1] for made in scene.finish()] == [cause]
 
 
-def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path, monkeypatch, caplog):
-    def full(*_: object) -> int:
-        raise OSError(28, "No space left on device")
+def full(*_: object) -> int:
+    raise OSError(28, "No space left on device")
 
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path, monkeypatch, caplog):
     scene = Scene(tmp_path)
     scene.run(20)
     scene.box.keep("asked")
@@ -151,15 +152,11 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path, monkeypatch, 
     assert [path.name for path in (tmp_path / "kept").iterdir()] == ["elbow.day.csv"]
 
 
-@pytest.mark.parametrize("full", [False, True])
-def test_keep_says_what_became_of_it(full, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("is_full", [False, True])
+def test_keep_says_what_became_of_it(is_full, tmp_path, monkeypatch, capsys):
     scene, status = Scene(tmp_path), []
-    if full:
-
-        def write(*_: object) -> int:
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr("drivelink.recording.sinks.os.write", write)
+    if is_full:
+        monkeypatch.setattr("drivelink.recording.sinks.os.write", full)
     asking = threading.Thread(target=lambda: status.append(cli.main(["keep", str(scene.path)])))
     asking.start()
     while asking.is_alive():
@@ -167,7 +164,7 @@ def test_keep_says_what_became_of_it(full, tmp_path, monkeypatch, capsys):
         time.sleep(0.01)
     out, err = capsys.readouterr()
     made = [path for path, _ in scene.finish()]
-    if full:
+    if is_full:
         assert status == [3] and not made and "No space left on device" in err
     else:
         assert status == [0] and out.splitlines()[-1] == f"{made[0]}: kept"
@@ -193,27 +190,26 @@ def test_keep_without_a_black_box_says_what_it_expects(tmp_path, capsys):
     assert "no black box writes there: expected a daemon that was started since" in capsys.readouterr().err
 
 
-def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path):
+def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path, capsys):
     bus = f'interface = "socketcand"\noptions = {{ host = "127.0.0.1", port = {zenohkit.free_port()} }}\nperiod_s = 0.005'
     path = tmp_path / "elbow.toml"
     text = vsa_text(channel="can0", endpoint=zenohkit.free_endpoint(), bus=bus)
     path.write_text(text + '[recording]\nfolder = "kept"\n')
-    with zenohkit.process("sim", str(path)) as drives:
-        assert "ready" in drives.stdout.readline()
-        with zenohkit.process("run", str(path), "--no-realtime", "--json") as daemon:
-            assert "ready" in daemon.stdout.readline()
-            zenohkit.until((tmp_path / "kept" / "elbow.day.csv").exists)  # it works
-            time.sleep(2.0)  # until the box has a state of the estimator
-            with zenohkit.process("keep", str(path), "--json") as asking:
-                zenohkit.until((tmp_path / "kept" / "elbow.keeping").exists)
-                time.sleep(0.5)  # something to keep
-                assert not kept(tmp_path / "kept", "elbow")  # 14 s more are to come, but the daemon ends
-                daemon.send_signal(signal.SIGTERM)
-                _, err = daemon.communicate(timeout=60)
-                said, _ = asking.communicate(timeout=60)
+    day, status = tmp_path / "kept" / "elbow.day.csv", []
+    asking = threading.Thread(target=lambda: status.append(cli.main(["keep", str(path), "--json"])))
+    with served(jointfile.load(path)), zenohkit.process("run", path, "--no-realtime", "--json") as daemon:
+        assert "ready" in daemon.stdout.readline()
+        # A row a second of the estimates: the box has had a state of the estimator by then.
+        zenohkit.until(lambda: day.exists() and day.read_text().count("\n") > 2)
+        asking.start()
+        zenohkit.until((tmp_path / "kept" / "elbow.keeping").exists)
+        assert not kept(tmp_path / "kept", "elbow")  # 15 s more are to come, but the daemon ends
+        daemon.send_signal(signal.SIGTERM)
+        _, err = daemon.communicate(timeout=60)
+        asking.join(60.0)
     assert daemon.returncode == 0 and "Traceback" not in err, err
     made = [one for one in (tmp_path / "kept").iterdir() if one.name.endswith("-asked.mcap")]
-    assert asking.returncode == 0 and json.loads(said)["recording"] == str(made[0])
+    assert status == [0] and json.loads(capsys.readouterr().out)["recording"] == str(made[0])
     cycles = list(recorded_cycles(made[0], 2))
     assert len(cycles) > 100
     assert any(m.topic == "/elbow/can" for m in read_messages(made[0]))

@@ -25,7 +25,8 @@ def stage() -> Iterator[LockstepStage]:
 
 @pytest.mark.parametrize("fault", [f for f in SCRIPT if f.where != "real"], ids=lambda fault: fault.name)
 def test_each_fault_is_flagged_said_once_and_survived_without_a_restart(stage, fault):
-    stage.settle()
+    if not stage.well:
+        stage.settle()
     stage.play(fault)
 
 

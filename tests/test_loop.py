@@ -64,6 +64,9 @@ def recorded(folder: Path, effects: tuple[str, ...] = (), name: str = NAME, **pa
     return made
 
 
+DIAGNOSED: list[diagnosing.Diagnosis] = []  # what was made of the recording with friction
+
+
 @pytest.fixture(scope="module")
 def friction(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording with friction, and its finding, made as the diagnosing process does but not at idle priority."""
@@ -73,6 +76,8 @@ def friction(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for owner, name in ((os, "nice"), (os, "sched_setscheduler"), (signal, "signal")):
             patch.setattr(owner, name, lambda *_: None)
         patch.setattr(diagnosing.logging, "basicConfig", lambda **_: None)
+        diagnose = diagnosing.diagnose
+        patch.setattr(diagnosing, "diagnose", lambda *how: DIAGNOSED.append(diagnose(*how)) or DIAGNOSED[0])
         assert diagnosing.main() == 0
     return made
 
@@ -130,6 +135,7 @@ def test_where_nothing_has_changed_nothing_is_proposed(tmp_path):
 @pytest.mark.usefixtures("pageless")
 def test_what_would_do_harm_is_not_proposed(friction, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "harm", lambda *_: "it is valid less often")
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *_: DIAGNOSED[0])
     made = tmp_path / friction.name
     made.write_bytes(friction.read_bytes())
     found = diagnosing.make(made)

@@ -105,7 +105,7 @@ def test_all_daemons_are_met_before_anybody_is_asked(endpoint):
         for name in names:
             daemon = stack.enter_context(script(name, endpoint))
             ready(daemon)
-        for _ in range(4):
+        for _ in range(2):
             assert joints(endpoint=endpoint) == names
             session = open_session(ZenohSection(endpoint=endpoint), Path())
             stack.callback(close_session, session)

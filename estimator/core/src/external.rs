@@ -22,7 +22,7 @@ pub use paper::PaperMomentum;
 
 use serde::{Deserialize, Serialize};
 
-use crate::choices::{BLOCK_S, BLOCKS, LATEST, LINK_FLOOR, MEAN_S, SETTLED, SLOW_S, SURE};
+use crate::choices::{BLOCK_S, BLOCKS, LATEST, LINK_FLOOR, MEAN_S, SETTLED, SLOW_S};
 use crate::effects::{Coordinates, Element};
 use crate::filters::StateVariableFilter;
 use crate::model::{Link, Model};
@@ -230,6 +230,12 @@ impl LinkMomentum {
         self.judge.test.reset();
     }
 
+    /// The link is later, or earlier, than was assumed: what was learned is of other moments.
+    pub fn shift(&mut self) {
+        self.errors = LinkErrors::default();
+        self.distrust();
+    }
+
     /// At rest here.
     pub fn restart(&mut self, q: f64, carried: f64) {
         let rest = StateVariableFilter::<3>::rest;
@@ -279,10 +285,13 @@ impl LinkMomentum {
 
     /// What the declared link leaves of one balance; variances that the curve and the readings give it.
     fn learn(&mut self, row: &link_errors::Row, left: f64, curve: f64, readings: f64) {
-        let doubt = self.errors.doubt(left, curve + readings, self.period);
-        // Errors of readings last as long as the filter does, what the model leaves as long as a motion.
-        let lasting = (readings / self.filter.bandwidth).max(self.errors.left() * MEAN_S);
-        self.errors.identify(row, left, doubt * lasting / self.period);
+        let expected = curve + readings;
+        let doubt = self.errors.doubt(left, expected, self.period);
+        if self.errors.is_usual(left, expected) {
+            // Errors of readings last as long as the filter does, what the model leaves as long as a motion.
+            let lasting = (readings / self.filter.bandwidth).max(self.errors.left() * MEAN_S);
+            self.errors.identify(row, left, doubt * lasting / self.period);
+        }
     }
 
     /// What is published of a sample that was used.
@@ -320,8 +329,7 @@ impl LinkMomentum {
         let around = carried.variance + read + unknown + late;
         let valid = valid && self.unsettled <= 0 && (sum + around + white).is_finite();
         let (torque, contact) = self.judge.judge(sum - off, self.carried[0], around, white, valid);
-        let usual = torque.abs() <= SURE * (around + white).sqrt();
-        if valid && usual && !contact {
+        if valid {
             let curve = carried.variance + (LINK_FLOOR * self.judge.largest).powi(2);
             self.learn(&row, sum - self.measured[0], curve, read + white + late);
         }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{MEMORY_S, TINY};
-use crate::choices::{ONE_WAY, SLOW, SLOW_S};
+use crate::choices::{MEAN_S, ONE_WAY, SLOW, SLOW_S, SURE};
 use crate::model::Link;
 
 const PARAMETERS: usize = 6;
@@ -28,10 +28,18 @@ pub(super) struct LinkErrors {
     information: [[f64; PARAMETERS]; PARAMETERS], // of the data alone; the lower triangle
     vector: [f64; PARAMETERS],
     fastest: f64,
-    direction: Option<f64>, // its mean over the memory: ±1 one way only, 0 to and fro
-    whole: f64,             // what all parameters make of the last row, the constant too
-    left: Option<f64>,      // mean square of what they leave of late, (N·m)², pushes apart …
-    unexplained: f64,       // … and the share of the time for which that is not what is expected
+    seen_s: f64, // time of motion, and of balances that it was learned from
+    learned_s: f64,
+    direction: f64,    // its mean over the memory: ±1 one way only, 0 to and fro
+    whole: [f64; 2],   // what all parameters make of the last row, the constant too, and its variance
+    left: Option<f64>, // mean square of what they leave of late, (N·m)², pushes apart …
+    unexplained: f64,  // … and the share of the time for which that is not what is expected
+}
+
+/// Gain of a mean over so many seconds, or over all that have passed.
+fn lately(passed_s: &mut f64, period_s: f64, span_s: f64) -> f64 {
+    *passed_s += period_s;
+    period_s / passed_s.min(span_s)
 }
 
 pub(super) type Row = [f64; PARAMETERS];
@@ -48,8 +56,7 @@ impl LinkErrors {
     /// One period of motion in this direction (−1 to 1) passes.
     pub(super) fn forget(&mut self, direction: f64, period_s: f64) {
         let kept = 1.0 - period_s / MEMORY_S;
-        let mean = self.direction.unwrap_or(direction.signum());
-        self.direction = Some(direction + kept * (mean - direction));
+        self.direction += lately(&mut self.seen_s, period_s, MEMORY_S) * (direction - self.direction);
         self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
     }
 
@@ -65,14 +72,40 @@ impl LinkErrors {
         (believed * torque, believed * variance + (1.0 - believed) * before + between)
     }
 
+    /// Whether errors of the link, or a load that stays, may leave so much; `expected`: variance of the rest.
+    pub(super) fn is_usual(&self, left: f64, expected: f64) -> bool {
+        let [torque, variance] = self.whole;
+        (left - torque).abs() <= SURE * (variance + expected).sqrt()
+    }
+
+    /// Forget the constant, and keep what it has taught of the others (Schur's complement).
+    fn open_constant(&mut self) {
+        let of = self.information.map(|row| row[CONSTANT]);
+        let known = of[CONSTANT].max(TINY * TINY);
+        let torque = self.vector[CONSTANT];
+        for i in 0..PARAMETERS {
+            self.vector[i] -= of[i] / known * torque;
+            (0..=i).for_each(|j| self.information[i][j] -= of[i] / known * of[j]);
+        }
+    }
+
     /// How much noisier a balance seems than expected, 1 or more, by what is left of it; `expected`: its variance.
+    ///
+    /// A load that has come to stay is another constant: once half of the time was not as expected, it may be any.
     pub(super) fn doubt(&mut self, left: f64, expected: f64, period_s: f64) -> f64 {
-        let square = (left - self.whole).powi(2);
-        let doubt = 1.0 + square / expected.max(TINY * TINY);
-        let gain = period_s / SLOW_S;
-        self.unexplained += gain * (1.0 - doubt.recip() - self.unexplained);
         let before = self.left.unwrap_or(expected);
+        if self.left.is_none() {
+            self.learned_s = MEAN_S; // what is expected counts as one motion
+        }
+        let gain = lately(&mut self.learned_s, period_s, SLOW_S);
+        let square = (left - self.whole[0]).powi(2);
+        let doubt = 1.0 + square / expected.max(TINY * TINY);
         self.left = Some(before + gain * (square / doubt - before));
+        let before = self.unexplained;
+        self.unexplained += gain * (1.0 - doubt.recip() - before);
+        if before <= 0.5 && self.unexplained > 0.5 {
+            self.open_constant();
+        }
         doubt
     }
 
@@ -88,7 +121,7 @@ impl LinkErrors {
         let mut vector = self.vector;
         let (mut torque, mut variance, mut level) = (0.0, 0.0, [0.0; PARAMETERS]);
         level[CONSTANT] = row[CONSTANT];
-        self.whole = 0.0;
+        self.whole = [0.0; 2];
         for i in 0..PARAMETERS {
             for j in 0..=i {
                 let sum: f64 = (0..j).map(|k| factor[i][k] * factor[j][k]).sum();
@@ -105,7 +138,8 @@ impl LinkErrors {
             level[i] /= factor[i][i];
             vector[i] /= factor[i][i];
             torque += own[i] * vector[i];
-            self.whole += (own[i] + level[i]) * vector[i];
+            let all = own[i] + level[i];
+            self.whole = [self.whole[0] + all * vector[i], self.whole[1] + all * all];
             variance += own[i] * own[i];
         }
         (torque, variance)
@@ -120,7 +154,7 @@ impl LinkErrors {
     pub(super) fn identify(&mut self, row: &Row, left: f64, noise: f64) {
         let weight = 1.0 / noise.max(TINY * TINY);
         let mut row = *row;
-        if self.direction.is_none_or(|mean| mean.abs() > ONE_WAY) {
+        if self.direction.abs() > ONE_WAY {
             (row[DAMPING], row[DRY]) = (0.0, 0.0);
         }
         for i in 0..PARAMETERS {
@@ -149,7 +183,7 @@ mod tests {
         };
         let truth: Row = [0.7, 0.03, -0.05, 0.2, 0.5, -0.1];
         let prior: Row = [1e6; PARAMETERS];
-        let mut errors = LinkErrors { direction: Some(0.0), ..LinkErrors::default() };
+        let mut errors = LinkErrors { seen_s: MEMORY_S, ..LinkErrors::default() }; // to and fro
         let mut row = [0.0; PARAMETERS];
         for k in 0..4000 {
             let t = 5e-3 * f64::from(k);

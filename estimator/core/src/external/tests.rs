@@ -53,6 +53,34 @@ fn a_load_on_a_link_that_turns_one_way_is_not_taken_for_its_friction() {
 }
 
 #[test]
+fn a_load_that_stays_is_not_taken_off_and_hides_no_error_of_the_link() {
+    // Inertia 5 % more than declared; the load is there from the start, or comes after 20 s.
+    let link = Link { inertia_std: 0.04, ..FREE };
+    let load = 4.0;
+    for begin in [0.0, 20.0] {
+        let mut momentum = LinkMomentum::new(&joint(link), &Settings::default(), &Priors::USUAL, T).unwrap();
+        momentum.reset();
+        momentum.restart(0.0, 0.0);
+        let carried = Carried { variance: 1e-4, ..Carried::default() };
+        let (mut worst, mut widest) = (0.0_f64, 0.0_f64);
+        for k in 1..60_000_u64 {
+            let t = k as f64 * T;
+            let (a, b) = ((2.1 * t).sin(), (5.3 * t).sin());
+            let acceleration = -0.8 * 2.1 * 2.1 * a - 0.3 * 5.3 * 5.3 * b;
+            let push = if t < begin { 0.0 } else { load };
+            momentum.feed(0.8 * a + 0.3 * b, Some(push - 1.05 * link.inertia * acceleration), f64::NAN, 0.0);
+            let external = momentum.conclude(k, &carried, 1e-14, k > 200);
+            if t > 40.0 {
+                worst = worst.max((external.torque - push).abs());
+                widest = widest.max(external.torque_std);
+            }
+        }
+        assert!(worst < 0.01, "{worst}"); // what is known of the curve
+        assert!(widest < 0.1 * link.inertia_std * 12.0, "{widest}"); // rad/s²: a tenth of what is declared
+    }
+}
+
+#[test]
 fn a_push_on_a_free_link_rises_as_its_filter_does() {
     // q = ½ (τ/M) t² with τ_e = 0: the residual is w³/(s + w)³ of the push.
     let settings = Settings { contact_torque: Some(0.1), ..Settings::default() };

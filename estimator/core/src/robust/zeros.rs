@@ -13,7 +13,7 @@ impl Robust {
             return;
         }
         self.live.unsettled = self.settle;
-        self.momentum.iter_mut().for_each(LinkMomentum::distrust);
+        self.momentum.iter_mut().for_each(LinkMomentum::shift);
         let last = &self.live.last.at;
         for (i, side) in self.sides.iter_mut().enumerate() {
             side.relearn(last.motor[i], last.deflection(i));

@@ -111,7 +111,7 @@ impl Side {
         if self.rigid || !self.fits || self.blocks.is_unconfirmed() {
             return None;
         }
-        let at = self.blocks.at(phi, self.deflection.link_rate(), &self.balance)?;
+        let at = self.blocks.at(phi, 0.0, &self.balance)?;
         let stiffness = at.stiffness + self.effects.spring(phi).1;
         let variance = self.blocks.posterior.as_ref()?.variance_along(&at.by_torque);
         Some(Carried {

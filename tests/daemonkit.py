@@ -110,6 +110,11 @@ class DaemonRig:
     def events(self) -> list[str]:
         return [event["text"] for event in self.daemon.events.recent()]
 
+    def forget(self) -> None:
+        """What was said until now is of no more interest, and may be said again."""
+        self.daemon.events._said.clear()
+        self.daemon.events._recent.clear()
+
     def run(self, cycles: int) -> list[Estimate]:
         """Run on; the estimates of these cycles."""
         before = len(self.collector.estimates)

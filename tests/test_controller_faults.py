@@ -27,6 +27,13 @@ from sim.excitation import build
 NO_TORQUE = (0.0, 0.0)
 
 
+@pytest.fixture(scope="module")
+def rig():
+    """On its way between its targets, for one fault after the other; each test leaves it as it was."""
+    with kit.running() as made:
+        yield made
+
+
 def test_it_goes_to_its_targets_and_when_it_is_dead_the_drives_end_the_torque():
     with kit.running(seconds=1.3, rest_s=0.6) as rig:
         targets = rig.controller.settings.targets
@@ -43,72 +50,71 @@ def test_it_goes_to_its_targets_and_when_it_is_dead_the_drives_end_the_torque():
         assert all(node.state == 0x05 for node in rig.network.nodes)  # and go on measuring for the daemon
 
 
-def test_a_killed_daemon_and_its_return_then_a_joint_that_has_changed():
-    with kit.running() as rig:
-        rig.kill_daemon()
-        assert kit.goes_safe(rig, rig.last_estimate_s) == "estimates are stale"
-        rig.run(0.5)
+def test_a_killed_daemon_and_its_return_then_a_joint_that_has_changed(rig):
+    rig.kill_daemon()
+    assert kit.goes_safe(rig, rig.last_estimate_s) == "estimates are stale"
+    rig.run(0.5)
+    assert rig.controller.phase == "safe"
+    rig.start_daemon()  # it knows nothing of before
+    assert kit.recovers(rig, 8.0) == ["identify", "run"]
+    put = rig.put
+    for doubt in (Status.CHANGED, Status.MODEL_ALARM):
+
+        def doubtful(tick, doubt=doubt):
+            put(tick)
+            one = rig._estimates[-1]
+            rig._estimates[-1] = one._replace(status=one.status | doubt)
+
+        rig.put = doubtful
+        rig.run(0.05)
         assert rig.controller.phase == "safe"
-        rig.start_daemon()  # it knows nothing of before
+        rig.put = put
         assert kit.recovers(rig, 8.0) == ["identify", "run"]
-        put = rig.put
-        for doubt in (Status.CHANGED, Status.MODEL_ALARM):
-
-            def doubtful(tick, doubt=doubt):
-                put(tick)
-                one = rig._estimates[-1]
-                rig._estimates[-1] = one._replace(status=one.status | doubt)
-
-            rig.put = doubtful
-            rig.run(0.05)
-            assert rig.controller.phase == "safe"
-            rig.put = put
-            assert kit.recovers(rig, 8.0) == ["identify", "run"]
 
 
-def test_zenoh_cut_and_back_then_a_drive_in_fault_that_is_reset_and_one_that_reboots():
-    with kit.running() as rig:
-        rig.cut = True
-        assert kit.goes_safe(rig, rig.last_estimate_s) == "estimates are stale"
-        rig.cut = False
-        assert kit.recovers(rig, 4.0) == ["run"]  # nothing is wrong with the joint: nothing to identify
-        rig.run(0.2)
-        rig.faults.emergency(rig.network.nodes[1], 0x2310)
-        assert kit.goes_safe(rig, rig.now_s) == "a drive reports a fault"
-        assert kit.recovers(rig, 4.0)[-1] == "run"
-        rig.faults.reboot(rig.network.nodes[0])  # set up by both masters and taken up again
-        rig.run(0.02)
-        assert rig.controller.phase == "safe"
-        kit.recovers(rig, 12.0)
+def test_zenoh_cut_and_back_then_a_drive_in_fault_that_is_reset_and_one_that_reboots(rig):
+    rig.cut = True
+    assert kit.goes_safe(rig, rig.last_estimate_s) == "estimates are stale"
+    rig.cut = False
+    assert kit.recovers(rig, 4.0) == ["run"]  # nothing is wrong with the joint: nothing to identify
+    rig.run(0.2)
+    rig.faults.emergency(rig.network.nodes[1], 0x2310)
+    assert kit.goes_safe(rig, rig.now_s) == "a drive reports a fault"
+    assert kit.recovers(rig, 4.0)[-1] == "run"
+    rig.faults.reboot(rig.network.nodes[0])  # set up by both masters and taken up again
+    rig.run(0.02)
+    assert rig.controller.phase == "safe"
+    kit.recovers(rig, 12.0)
 
 
-@pytest.mark.parametrize("reaction", [pytest.param("stop", marks=pytest.mark.slow), "retract", "soften"])
-def test_it_reacts_to_a_push_and_goes_on_when_it_is_gone(reaction):
-    with kit.running(reaction=reaction) as rig:
-        push = {"kind": "none", "external": {"kind": "none", "offset_nm": 0.12}}
-        rig.world.excitation = build(push, 2)
-        assert rig.run(0.03, "react"), rig.events
-        assert rig.events[-1][1] == f"contact: {reaction}"
-        at = rig.world.truth().link_position_rad
-        rig.run(0.45)
-        truth = rig.world.truth()
-        if reaction == "retract":
-            assert truth.link_position_rad - at > 0.8 * rig.controller.settings.retract_rad
-        elif reaction == "soften":
-            assert truth.stiffness_nm_rad < 1.1 * rig.controller.settings.soft_nm_rad
-        rig.world.excitation = build({"kind": "none"}, 2)
-        assert kit.recovers(rig, 12.0)[-1] == "run"
+@pytest.mark.parametrize("reaction", ["stop", "retract", "soften"])
+def test_it_reacts_to_a_push_and_goes_on_when_it_is_gone(rig, reaction):
+    rig.controller.settings = replace(rig.controller.settings, reaction=reaction)
+    push = {"kind": "none", "external": {"kind": "none", "offset_nm": 0.12}}
+    rig.world.excitation = build(push, 2)
+    assert rig.run(0.03, "react"), rig.events
+    assert rig.events[-1][1] == f"contact: {reaction}"
+    at = rig.world.truth().link_position_rad
+    rig.run(0.45)
+    truth = rig.world.truth()
+    if reaction == "retract":
+        assert truth.link_position_rad - at > 0.8 * rig.controller.settings.retract_rad
+    elif reaction == "soften":
+        assert truth.stiffness_nm_rad < 1.1 * rig.controller.settings.soft_nm_rad
+    rig.world.excitation = build({"kind": "none"}, 2)
+    assert kit.recovers(rig, 12.0)[-1] == "run"
 
 
-@pytest.mark.slow
-def test_a_wall_is_not_leant_on():
-    with kit.running() as rig:
-        truth = rig.world.truth()
-        q, side = truth.link_position_rad, int(math.copysign(1, truth.link_velocity_rad_s))
-        rig.world.alter(effects=[parse(f"contact=3.0,position_rad={q:.4f},side={side}")])
-        assert rig.run(0.08, "react"), rig.events
-        rig.run(0.45)
-        assert 3.0 * side * (rig.world.truth().link_position_rad - q) < 0.06
+def test_a_wall_is_not_leant_on(rig):
+    rig.run(0.5)
+    truth = rig.world.truth()
+    q, side = truth.link_position_rad, int(math.copysign(1, truth.link_velocity_rad_s))
+    rig.world.alter(effects=[parse(f"contact=3.0,position_rad={q:.4f},side={side}")])
+    assert rig.run(0.08, "react"), rig.events
+    rig.run(0.45)
+    assert 3.0 * side * (rig.world.truth().link_position_rad - q) < 0.06
+    rig.world.alter(effects=[])
+    kit.recovers(rig, 12.0)
 
 
 def test_drives_are_set_up_enabled_and_commanded_by_the_controllers_own_objects_alone(capsys):

@@ -1,5 +1,6 @@
 """What a bus does to a daemon, cycle by cycle; what each fault of a list ends in is in test_fault_script."""
 
+from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
@@ -20,10 +21,19 @@ def valid(estimates: list[Estimate]) -> list[bool]:
     return [bool(estimate.status & Status.VALID) for estimate in estimates]
 
 
-def settle(made: DaemonRig) -> None:
-    """Past the estimator's start."""
-    back(made)
-    assert made.status["state"] == "running"
+@pytest.fixture(scope="module")
+def settled() -> Iterator[DaemonRig]:
+    """Past the estimator's start, for one fault after the other."""
+    with rig() as one:
+        yield one
+
+
+@pytest.fixture
+def made(settled: DaemonRig) -> DaemonRig:
+    back(settled)
+    settled.forget()
+    assert settled.status["state"] == "running"
+    return settled
 
 
 def test_every_cycle_has_an_estimate_in_order_and_a_counter_on_sync_is_made_where_it_is_asked_for():
@@ -53,70 +63,66 @@ def test_cycles_lost_by_a_slow_machine_are_said_in_words_once():
         assert "this machine keeps up with the cycle again; cycles left out: 3" in made.events
 
 
-def test_a_drive_that_takes_the_start_and_does_not_run_is_said_once():
-    with rig() as made:
-        settle(made)
-        node = made.node(2)
-        take = node.nmt
-        node.nmt = lambda command: None if command == 0x01 else take(command)
-        made.faults.reboot(node)
-        assert not any(valid(made.run(ENOUGH))[2:])
-        said = [text for text in made.events if "was started, but sends none of its frames" in text]
-        assert said == [
-            "node 2 is configured and was started, but sends none of its frames; it says pre-operational"
-        ]
-        node.nmt = take
-        back(made)
-        made.run(SOON)
-        assert made.status["state"] == "running"
-        assert made.status["conditions"] == []
+def test_a_drive_that_takes_the_start_and_does_not_run_is_said_once(made):
+    node = made.node(2)
+    take = node.nmt
+    node.nmt = lambda command: None if command == 0x01 else take(command)
+    made.faults.reboot(node)
+    assert not any(valid(made.run(ENOUGH))[2:])
+    said = [text for text in made.events if "was started, but sends none of its frames" in text]
+    assert said == [
+        "node 2 is configured and was started, but sends none of its frames; it says pre-operational"
+    ]
+    node.nmt = take
+    back(made)
+    made.run(SOON)
+    assert made.status["state"] == "running"
+    assert made.status["conditions"] == []
 
 
 @pytest.mark.parametrize("able", [True, False])
-def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(able):
+def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(made, able, monkeypatch):
     """As one in whose place another device with its number was configured."""
-    with rig() as made:
-        settle(made)
-        heartbeat = made.node(2).heartbeat
-        heartbeat._period.value = 0
-        heartbeat.restart()
-        if not able:
-            heartbeat._period.changed = lambda: None
-        made.run(2 * ENOUGH if able else 8000 + ENOUGH)
-        said = [text for text in made.events if text.startswith("node 2")]
-        assert sum("is configured again" in text for text in said) == 1
-        assert (said[-1] == "node 2: heartbeat is back") == able
-        assert made.run(1)[0].status & Status.VALID
+    heartbeat = made.node(2).heartbeat
+    heartbeat._period.value = 0
+    heartbeat.restart()
+    if not able:
+        monkeypatch.setattr(heartbeat._period, "changed", lambda: None)
+    made.run(2 * ENOUGH if able else 8000 + ENOUGH)
+    said = [text for text in made.events if text.startswith("node 2")]
+    assert sum("is configured again" in text for text in said) == 1
+    assert (said[-1] == "node 2: heartbeat is back") == able
+    assert made.run(1)[0].status & Status.VALID
 
 
 def test_a_second_reboot_begins_the_configuration_anew_and_what_goes_wrong_in_it_is_that_nodes_own(
-    monkeypatch,
+    made, monkeypatch
 ):
-    with rig() as made:
-        settle(made)
-        made.run(2000)  # enough is learned to hold blocks after a reboot against
+    made.run(2000)  # enough is learned to hold blocks after a reboot against
+    before = made.status["nodes"]["2"]["reboots"]
+    made.faults.reboot(made.node(2))
+    for _ in range(3):
+        made.run(8)
+        assert made.daemon.pipelines[0].assembler.untrusted == (2,)
         made.faults.reboot(made.node(2))
-        for _ in range(3):
-            made.run(8)
-            assert made.daemon.pipelines[0].assembler.untrusted == (2,)
-            made.faults.reboot(made.node(2))
-        back(made)
-        assert made.status["nodes"]["2"]["reboots"] == 4
+    back(made)
+    assert made.status["nodes"]["2"]["reboots"] == before + 4
 
-        def broken(*_: object, **__: object) -> None:
-            raise OverflowError("int too large to convert to float")
+    def broken(*_: object, **__: object) -> None:
+        raise OverflowError("int too large to convert to float")
 
-        monkeypatch.setattr("drivelink.canopen.node.offer", broken)
-        made.faults.reboot(made.node(1))
-        assert len(made.run(1500)) >= 1499  # a cycle that lacks a frame is concluded with the next SYNC
-        said = "node 1 cannot be configured: node 1: OverflowError in its configuration: int too large"
-        assert said in " ".join(made.events)
-        monkeypatch.undo()
-        back(made)  # and until motion has shown its zero
+    monkeypatch.setattr("drivelink.canopen.node.offer", broken)
+    made.faults.reboot(made.node(1))
+    assert len(made.run(1500)) >= 1499  # a cycle that lacks a frame is concluded with the next SYNC
+    said = "node 1 cannot be configured: node 1: OverflowError in its configuration: int too large"
+    assert said in " ".join(made.events)
+    monkeypatch.undo()
+    back(made)  # and until motion has shown its zero
 
 
 def bunches(made: DaemonRig, listener: Listener, count: int) -> list[str]:
     """One frame of node 2 is missing, and two more than one come afterwards; what is said of that."""
+    before = made.status["nodes"]["2"]["conflicting"]
     number, cob_id = made.tpdo(2)
     for k in range(count):
         made.faults.mute(made.node(2), number)
@@ -124,39 +130,36 @@ def bunches(made: DaemonRig, listener: Listener, count: int) -> list[str]:
         listener.send(cob_id, bytes([k % 100] * 8))
         listener.send(cob_id, bytes([k % 100 + 101] * 8))
         made.run(8)
-    assert made.status["nodes"]["2"]["conflicting"] >= count / 2
+    assert made.status["nodes"]["2"]["conflicting"] >= before + count / 2
     return [event for event in made.events if "used" in event]
 
 
-def test_frames_in_bunches_are_no_second_device_and_stopped_nodes_are_woken_before_they_are_asked():
-    with rig() as made:
-        settle(made)
-        listener = Listener(made.joint)
-        assert bunches(made, listener, 10) == []
-        made.run(1500)
-        assert not [event for event in made.events if "used" in event]
-        (said,) = bunches(made, listener, 150)  # 1.5 s of it
-        assert said.startswith("node 2: some frames are missing, others come several in one cycle")
-        made.run(1500)
-        assert not made.status["conditions"]
-        # Nodes that somebody stopped are woken before they are asked.
-        listener.send(0x000, b"\x02\x00")
-        back = next(k for k, e in enumerate(made.run(3000)[100:]) if not e.status & Status.STALE)
-        listener.close()
+def test_frames_in_bunches_are_no_second_device_and_stopped_nodes_are_woken_before_they_are_asked(made):
+    listener = Listener(made.joint)
+    assert bunches(made, listener, 10) == []
+    made.run(1500)
+    assert not [event for event in made.events if "used" in event]
+    (said,) = bunches(made, listener, 150)  # 1.5 s of it
+    assert said.startswith("node 2: some frames are missing, others come several in one cycle")
+    made.run(1500)
+    assert not made.status["conditions"]
+    # Nodes that somebody stopped are woken before they are asked.
+    listener.send(0x000, b"\x02\x00")
+    back = next(k for k, e in enumerate(made.run(3000)[100:]) if not e.status & Status.STALE)
+    listener.close()
     # Silence of half a second, and no SDO timeout (0.2 s each time) for any of the three.
     assert back < 800
 
 
 @pytest.mark.parametrize("segment_bytes", [7, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 1))])
-def test_a_drive_that_answers_sdo_without_end_harms_itself_only(segment_bytes):
-    with rig() as made:
-        settle(made)
-        made.faults.endless_sdo(made.node(2), segment_bytes)
-        made.faults.reboot(made.node(2))
-        made.run(6000)
-        cannot = [text for text in made.events if text.startswith("node 2 cannot be configured: ")]
-        assert cannot
-        assert len(made.run(100)) == 100  # the loop goes on, and says that these are stale
-        assert made.status["nodes"]["1"]["missing"] == 0
-        made.faults.endless_sdo(made.node(2), -1)
-        back(made)
+def test_a_drive_that_answers_sdo_without_end_harms_itself_only(made, segment_bytes):
+    missing = made.status["nodes"]["1"]["missing"]
+    made.faults.endless_sdo(made.node(2), segment_bytes)
+    made.faults.reboot(made.node(2))
+    made.run(6000)
+    cannot = [text for text in made.events if text.startswith("node 2 cannot be configured: ")]
+    assert cannot
+    assert len(made.run(100)) == 100  # the loop goes on, and says that these are stale
+    assert made.status["nodes"]["1"]["missing"] == missing
+    made.faults.endless_sdo(made.node(2), -1)
+    back(made)

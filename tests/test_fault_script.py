@@ -33,7 +33,7 @@ def test_each_fault_is_flagged_said_once_and_survived_without_a_restart(stage, f
 @pytest.mark.slow
 @pytest.mark.real_time
 def test_a_short_soak_in_real_time_ends_well_and_with_as_many_threads():
-    options = Namespace(seconds=20.0, seed=7, lockstep=False, two=0.0, recount=0.0)
+    options = Namespace(seconds=10.0, seed=7, lockstep=False, two=0.0, recount=0.0)
     result = Soak(options).run()
     assert result["faults"] >= 1  # how many fit into the time depends on the machine
     assert len(result["threads"]) == 1

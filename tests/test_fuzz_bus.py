@@ -72,7 +72,7 @@ def test_after_all_that_a_calm_bus_gives_valid_estimates_again():
     assert run.supervisor.node_status(run.loop.loop_joints[0])["2"]["state"] == "operational"
 
 
-@pytest.mark.parametrize("times", [25, pytest.param(400, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
+@pytest.mark.parametrize("times", [25, pytest.param(200, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
 @pytest.mark.parametrize("parser", PARSERS)
 def test_damaged_inputs_are_read_or_refused_in_one_line(parser, times, tmp_path, caplog):
     caplog.set_level(logging.CRITICAL)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
+import zenohkit
 from daemonkit import served, vsa
 from zenohkit import LIMIT_S, joint_text, ready, script, until
 
@@ -21,18 +22,20 @@ from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import FILES, close_session, daemon_config, open_client, open_session
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
+def three():
+    """The endpoint of the daemons a, b and c, which start at once and all ask for it; and their processes."""
+    endpoint = zenohkit.free_endpoint()
+    with script("a", endpoint) as a, script("b", endpoint) as b, script("c", endpoint) as c:
+        ready(a), ready(b), ready(c)
+        yield endpoint, (a, b, c)
+
+
 def plain_client(endpoint):
-    """A function that opens a client as somebody else would write it: no drivelink in it."""
-    text = json.dumps(
-        {
-            "mode": "client",
-            "connect": {"endpoints": [endpoint]},
-            "scouting": {"multicast": {"enabled": False}},
-        }
-    )
-    with ExitStack() as stack:
-        yield lambda: stack.enter_context(zenoh.open(zenoh.Config.from_json5(text)))
+    """A client as somebody else would write it: no drivelink in it."""
+    connect, scouting = {"endpoints": [endpoint]}, {"multicast": {"enabled": False}}
+    text = json.dumps({"mode": "client", "connect": connect, "scouting": scouting})
+    return zenoh.open(zenoh.Config.from_json5(text))
 
 
 def hear(session, expected):
@@ -55,12 +58,11 @@ def hear(session, expected):
     until(exactly)
 
 
-def test_when_the_first_daemon_is_killed_the_others_are_received_again(endpoint, plain_client):
+def test_when_the_first_daemon_is_killed_the_others_are_received_again(endpoint):
     with script("a", endpoint) as a:
         ready(a)
-        with script("b", endpoint) as b, script("c", endpoint) as c:
+        with script("b", endpoint) as b, script("c", endpoint) as c, plain_client(endpoint) as session:
             ready(b), ready(c)
-            session = plain_client()
             hear(session, {"a", "b", "c"})
             a.kill()
             a.wait()
@@ -70,19 +72,18 @@ def test_when_the_first_daemon_is_killed_the_others_are_received_again(endpoint,
                 hear(session, {"a", "b", "c"})
 
 
-def test_daemons_that_start_before_any_of_them_listens_still_meet(endpoint, plain_client):
-    with script("a", endpoint) as a, script("b", endpoint) as b:  # at once: both ask for the endpoint
-        ready(a), ready(b)
-        hear(plain_client(), {"a", "b"})
+def test_daemons_that_start_before_any_of_them_listens_still_meet(three):
+    with plain_client(three[0]) as session:
+        hear(session, {"a", "b", "c"})
 
 
-def test_nothing_listens_beyond_the_loopback_and_nothing_is_multicast(endpoint):
+def test_nothing_listens_beyond_the_loopback_and_nothing_is_multicast(three):
+    endpoint, processes = three
     config = daemon_config(endpoint, listen=True)
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
     assert json.loads(config.get_json("adminspace/enabled")) is False
     local = set()
-    with script("a", endpoint) as process:
-        ready(process)
+    for process in processes:
         proc = Path(f"/proc/{process.pid}")
         inodes = {link.readlink().name for link in (proc / "fd").iterdir() if link.exists()}
         for table in ("tcp", "tcp6", "udp", "udp6"):
@@ -99,18 +100,15 @@ def test_of_two_daemons_that_start_at_once_with_one_name_one_stays(endpoint):
         assert stays.poll() is None
 
 
-def test_all_daemons_are_met_before_anybody_is_asked(endpoint):
-    names = ["one", "three", "two"]
-    with ExitStack() as stack:
-        for name in names:
-            daemon = stack.enter_context(script(name, endpoint))
-            ready(daemon)
-        for _ in range(2):
-            assert joints(endpoint=endpoint) == names
-            session = open_session(ZenohSection(endpoint=endpoint), Path())
-            stack.callback(close_session, session)
-            with pytest.raises(ZenohError, match="another daemon already serves a joint named two"):
-                JointPublisher(session, parse(joint_text("two", endpoint)))
+def test_all_daemons_are_met_before_anybody_is_asked(three):
+    endpoint, _ = three
+    for name in "ac":
+        assert joints(endpoint=endpoint) == ["a", "b", "c"]
+        with (
+            closing(open_session(ZenohSection(endpoint=endpoint), Path())) as session,
+            pytest.raises(ZenohError, match=f"another daemon already serves a joint named {name}"),
+        ):
+            JointPublisher(session, parse(joint_text(name, endpoint)))
 
 
 def test_an_uncaught_exception_ends_the_process(endpoint):
@@ -205,19 +203,19 @@ def test_a_daemon_says_that_its_router_is_lost_and_back(endpoint, router):
     assert [event["text"] for event in daemon.events.recent()][-1] == "the zenoh router is back"
 
 
-def test_connections_that_say_nothing_lock_no_subscriber_out(endpoint):
+def test_connections_that_say_nothing_lock_no_subscriber_out(three):
     """Each waits for its handshake; more than may wait at a time would make a subscriber wait, too."""
+    endpoint, daemons = three
     idle, (mine, permitted) = 1200, resource.getrlimit(resource.RLIMIT_NOFILE)
-    with script("elbow", endpoint) as daemon:
-        ready(daemon)
+    for daemon in daemons:
         limits = Path(f"/proc/{daemon.pid}/limits").read_text(encoding="ascii")
         files = next(line for line in limits.splitlines() if line.startswith("Max open files"))
         assert int(files.split()[3]) >= min(8192, permitted if permitted > 0 else 8192)
-        waiting = json.loads(daemon_config(endpoint, listen=True).get_json("transport/unicast"))
-        assert idle < waiting["accept_pending"] < FILES
-        host, port = endpoint.removeprefix("tcp/").split(":")
-        with ExitStack() as stack:
-            for _ in range(min(idle, mine - 200)):
-                stack.enter_context(socket.create_connection((host, int(port))))
-            with open_client(endpoint) as session:
-                hear(session, {"elbow"})
+    waiting = json.loads(daemon_config(endpoint, listen=True).get_json("transport/unicast"))
+    assert idle < waiting["accept_pending"] < FILES
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    with ExitStack() as stack:
+        for _ in range(min(idle, mine - 200)):
+            stack.enter_context(socket.create_connection((host, int(port))))
+        with open_client(endpoint) as session:
+            hear(session, {"a", "b", "c"})

@@ -157,7 +157,7 @@ def write_whole(path: Path, data: str | bytes, *, force: bool = False) -> None:
 
 
 def put_in_place(temporary: Path, path: Path, *, force: bool) -> None:
-    """Give a complete, synced file its name, and sync the folder.
+    """Rename a complete, synced file, and sync the folder.
 
     Raises:
         OSError: a file exists and `force` is not given, or the folder cannot be written.
@@ -198,5 +198,5 @@ def _mode(path: Path) -> int | None:
 
 
 def _beside(path: Path) -> Path:
-    """An unused hidden name in the same folder."""
+    """Return an unused hidden name in the same folder."""
     return path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}.tmp")

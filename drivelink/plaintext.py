@@ -71,7 +71,7 @@ def spell_out() -> None:
 
 
 def stamped(text: str, stream: TextIO, indent: int = 9) -> str:
-    """Put the time of day before a line, and fold it to at most 100 columns of a terminal.
+    """Write the time of day before a line, and fold it to at most 100 columns of a terminal.
 
     Args:
         stream: where it goes; a journal has stamps of its own.

@@ -231,7 +231,7 @@ def _multisine(keys: _Keys, motors: int) -> list[Profile]:
 
 
 def _chirp(keys: _Keys, motors: int) -> list[Profile]:
-    """A sine whose frequency goes from low to high and back, geometrically, each way in sweep_s."""
+    """Return a sine whose frequency goes from low to high and back, geometrically, each way in sweep_s."""
     low, high = _band(keys, 0.1, 10.0)
     sweep_s = keys.number("sweep_s", 10.0, 1e-3)
     rate = math.log(high / low) / sweep_s

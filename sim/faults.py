@@ -68,7 +68,7 @@ class Faults:
         self._network.power_on(node)
 
     def reboot(self, node: Node) -> None:
-        """Let it reset itself: an unexpected boot-up message."""
+        """Reset the node: an unexpected boot-up message."""
         node.reset_node()
 
     def emergency(self, node: Node, code: int, register: int = 0, vendor: bytes = b"") -> None:
@@ -83,15 +83,15 @@ class Faults:
         node.misread = lie
 
     def ignore_sdo(self, node: Node, requests: int) -> None:
-        """Let its SDO server ignore so many requests."""
+        """Make its SDO server ignore so many requests."""
         node.sdo.ignored = requests
 
     def refuse_sdo(self, node: Node, code: int, requests: int) -> None:
-        """Let its SDO server abort so many requests."""
+        """Make its SDO server abort so many requests."""
         node.sdo.refusal, node.sdo.refused = code, requests
 
     def endless_sdo(self, node: Node, segment_bytes: int) -> None:
-        """Let its SDO server answer uploads without end, so many bytes (0 to 7) at a time; -1: stop."""
+        """Make its SDO server answer uploads without end, so many bytes (0 to 7) at a time; -1: stop."""
         node.sdo.endless = segment_bytes
 
     def impostor(self, node: Node) -> None:
@@ -119,7 +119,7 @@ class Faults:
         self._tap(node, tpdo).late = cycles
 
     def resize(self, node: Node, tpdo: int, length: int, cycles: int = 1) -> None:
-        """Give so many transmissions of a TPDO a length of `length` bytes (0 to 8)."""
+        """Send so many transmissions of a TPDO with a length of `length` bytes (0 to 8)."""
         tap = self._tap(node, tpdo)
         tap.length, tap.cut = length, cycles
 
@@ -132,7 +132,7 @@ class Faults:
         self._network.reverse()
 
     def babble(self, can_id: int, data: bytes = b"", per_cycle: int = 10) -> None:
-        """Let a node send additional frames with every SYNC; `per_cycle` 0 stops it."""
+        """Make a node send additional frames with every SYNC; `per_cycle` 0 stops it."""
         self._babble = (can_id, data, per_cycle) if per_cycle else None
 
     def drop_sync(self, count: int = 1) -> None:

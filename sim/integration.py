@@ -85,7 +85,7 @@ def whole_fraction(period_s: float, step_s: float | None, plant: JointPlant, fin
 
 
 def _fastest(plant: JointPlant) -> float:
-    """A bound on the joint's fastest natural frequency (rad/s) at twice the stiffness at rest."""
+    """Return a bound on the joint's fastest natural frequency (rad/s) at twice the stiffness at rest."""
     if plant.rigid:
         return 0.0
     springs = plant.motors if plant.arrangement == "antagonistic" else plant.motors[:1]

@@ -81,7 +81,7 @@ class Network:
         self.power_on(node)
 
     def reverse(self) -> None:
-        """Let the devices answer SYNC in the opposite order."""
+        """Make the devices answer SYNC in the opposite order."""
         self._alive.reverse()
 
     def power_on(self, node: Node | None = None) -> None:
@@ -266,7 +266,7 @@ class Network:
             self._drift()
 
     def _drift(self) -> None:
-        """Without SYNC, advance the world by the wall clock."""
+        """Advance the world by the wall clock, without SYNC."""
         stamp_s = time.time()
         late_s = stamp_s - self._anchor_s
         if not 0.0 <= late_s < _LONGEST_CATCH_UP_S:

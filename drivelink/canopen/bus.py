@@ -163,7 +163,7 @@ def _connecting(section: BusSection) -> Iterator[None]:
 
 
 def _socketcand_socket(bus: can.BusABC) -> socket.socket:
-    """The connection of python-can's client, which has no public name."""
+    """Return the connection of python-can's client, which has no public name."""
     found: socket.socket = bus._SocketCanDaemonBus__socket  # type: ignore[attr-defined]
     return found
 
@@ -307,7 +307,7 @@ def run_program(
 
 
 def frames(bus: FrameBus, seconds: float, idle: Idle | None = None) -> Iterator[can.Message | None]:
-    """The frames of so many seconds; None where there is none for a while.
+    """Yield the frames of so many seconds; None where there is none for a while.
 
     Raises:
         BusError: the bus fails.

@@ -95,7 +95,7 @@ class Configurator:
         return bool(self._sessions or self._ended)
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
-        """Take a frame; only SDO responses (0x581 to 0x5FF) are of interest."""
+        """Process a frame; only SDO responses (0x581 to 0x5FF) are of interest."""
         node = cob_id - 0x580
         if node in self._sessions:
             self._advance(node, lambda session: session.feed(cob_id, data, now_s))
@@ -109,7 +109,7 @@ class Configurator:
         return ended
 
     def _advance(self, node: int, step: Callable[[Session[NodeLayout]], object]) -> None:
-        """Let a configuration go on; whatever the node provokes ends its own one."""
+        """Advance a configuration; whatever the node provokes ends its own one."""
         session = self._sessions[node]
         result: NodeLayout | DriveError
         try:

@@ -142,7 +142,7 @@ def _sections(text: str, sheet: DataSheet) -> Sections:
 
 
 def _number(text: str, node: int = 0) -> int | None:
-    """A number in any notation of the files, `$NODEID` included."""
+    """Return a number in any notation of the files, `$NODEID` included."""
     relative = bool(_NODE.search(text))
     text = _NODE.sub("", text).replace(" ", "").strip("+")
     if not text or len(text) > _MOST_DIGITS:
@@ -156,7 +156,7 @@ def _number(text: str, node: int = 0) -> int | None:
 
 
 def _made_for(sections: Sections) -> int | None:
-    """The node a DCF was made for: declared, or from its first TPDO's identifier."""
+    """Return the node a DCF was made for: declared, or from its first TPDO's identifier."""
     for name in ("devicecomissioning", "devicecommissioning"):
         stated = _number(sections.get(name, {}).get("nodeid", ""))
         if stated is not None and 1 <= stated <= 127:
@@ -209,7 +209,7 @@ def _read_objects(sections: Sections, node: int, sheet: DataSheet) -> None:
 
 
 def _data_type(keys: dict[str, str], sections: Sections) -> int:
-    """The declared type; the base type for CANFestival's editor, which writes a section for each type."""
+    """Return the declared type; the base type for CANFestival's editor, which has a section for each."""
     data_type = _number(keys.get("datatype", "")) or 0
     base = sections.get(f"{data_type:x}sub1", {}).get("defaultvalue", "") if data_type > 0x1B else ""
     return _number(base) or data_type

@@ -22,7 +22,7 @@ class ForbiddenFrameError(Exception):
 
 
 def _is_writable(index: int) -> bool:
-    """Whether an object of a drive may be written: SYNC, heartbeat, TPDO communication and mapping."""
+    """Return whether an object of a drive may be written: SYNC, heartbeat, TPDO communication and mapping."""
     return index in _WRITABLE or 0x1800 <= index <= 0x1BFF
 
 

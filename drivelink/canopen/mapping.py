@@ -256,7 +256,7 @@ class Mapper:
             self._mark_fixed(tpdo, abort)
 
     def _is_full(self, tpdo: Tpdo, position: int, abort: SdoAbort) -> Program[bool]:
-        """Whether the mapping is full, rather than the object unknown to the node."""
+        """Return whether the mapping is full, rather than the object unknown to the node."""
         if abort.code != _NO_SUBINDEX:
             return abort.code == _TOO_MANY
         try:

@@ -103,7 +103,7 @@ def _units(role: Role, vendor: Vendor) -> Program[tuple[dict[Address, int], SdoA
 
 
 def _changed(survey: NodeSurvey) -> Program[str]:
-    """What the node says otherwise than before it was configured; empty: nothing.
+    """Return what the node says otherwise than before it was configured; empty: nothing.
 
     The answer of somebody else comes once, and a unit that is wrong scales everything that follows.
     """
@@ -132,7 +132,7 @@ def _first_contact(node: int, patience: int, wake: bool) -> Program[int]:
 
 
 def _existing(node: int, candidates: tuple[MappedObject, ...]) -> Program[tuple[MappedObject, ...]]:
-    """The objects that exist, with their actual length; some have no value before the drive runs."""
+    """Return the objects that exist, with their actual length; some have no value before the drive runs."""
     found = []
     for candidate in candidates:
         try:

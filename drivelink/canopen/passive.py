@@ -73,13 +73,13 @@ class _PassiveNode:
         self.lost = why
 
     def request(self, data: bytes, now_s: float) -> None:
-        """Take an SDO frame of the master."""
+        """Process an SDO frame of the master."""
         address = written_object(data)
         self.stored = self.stored or (address is not None and address[0] in _STORE_OR_RESTORE)
         self.listener.request(data, now_s)
 
     def response(self, data: bytes, now_s: float) -> None:
-        """Take an SDO frame of the node."""
+        """Process an SDO frame of the node."""
         changes = self.listener.changes
         self.listener.response(data, now_s)
         if self.listener.changes != changes:
@@ -222,7 +222,7 @@ class _PassiveNode:
         return _sent(tpdos_of({**self._sheet.values(), **seen}))
 
     def _number(self, section: TpdoSection, seen: dict[Address, int]) -> int:
-        """The number of a TPDO that the joint file declares by its identifier; 0: unknown."""
+        """Return the number of a TPDO that the joint file declares by its identifier; 0: unknown."""
         for (index, subindex), value in seen.items():
             if index < 0x1A00 and subindex == 1 and value & 0x7FF == section.cob_id:
                 return index - 0x17FF
@@ -250,7 +250,7 @@ class _PassiveNode:
 
 
 def _sent(tpdos: Iterable[Tpdo]) -> tuple[Tpdo, ...]:
-    """The enabled and known TPDOs, one per identifier."""
+    """Return the enabled and known TPDOs, one per identifier."""
     found: dict[int, Tpdo] = {}
     for tpdo in tpdos:
         if tpdo.enabled and tpdo.known and 0x181 <= tpdo.cob_id <= 0x57F:
@@ -313,7 +313,7 @@ class PassiveConfigurator:
         return self._nodes[node].listener.unasked
 
     def adopt(self, layouts: Iterable[NodeLayout]) -> None:
-        """Take layouts from another source; later traffic has priority."""
+        """Adopt layouts from another source; later traffic has priority."""
         for layout in layouts:
             node = self._nodes.get(layout.node_id)
             if node is not None:
@@ -330,7 +330,7 @@ class PassiveConfigurator:
             self._nodes[node].lose_sight(why)
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
-        """Take a frame: SDO, boot-up, NMT resets, PDOs.
+        """Process a frame: SDO, boot-up, NMT resets, PDOs.
 
         Args:
             now_s: time by any clock, for the SDO time-out.

@@ -185,7 +185,7 @@ def objects_of(tpdo: Tpdo, number: int) -> dict[Address, int]:
 
 
 def _entries(values: Mapping[Address, int], mapping: int) -> tuple[Entry, ...] | None:
-    """The entries; None if one of them is unknown, or they are more than a frame carries."""
+    """Return the entries; None if one of them is unknown, or they are more than a frame carries."""
     count = values.get((mapping, 0))
     entries: list[Entry] = []
     for subindex in range(1, (_MOST_ENTRIES if count is None else min(count, _MOST_ENTRIES)) + 1):
@@ -224,7 +224,7 @@ def decode(
 
 
 def _layout(tpdo: Tpdo, chosen: dict[Address, MappedObject]) -> TpdoLayout:
-    """One frame; what it carries is taken out of `chosen`."""
+    """Return one frame; what it carries is taken out of `chosen`."""
     objects = []
     for index, subindex, bits in tpdo.entries:
         candidate = chosen.pop((index, subindex), None)

@@ -152,7 +152,7 @@ class _Transfer:
         return bytes([command]) + object_ + request.value.to_bytes(request.size, "little").ljust(4, b"\0")
 
     def answer(self, data: bytes) -> bytes | None:
-        """Take a frame of the server; return the frame to send next, if any.
+        """Process a frame of the server; return the frame to send next, if any.
 
         Raises:
             SdoAbort: the server aborted.
@@ -255,7 +255,7 @@ class Session(Generic[T]):
         return self._result  # type: ignore[return-value]
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
-        """Take a frame of the bus; frames of other transfers are ignored."""
+        """Process a frame of the bus; frames of other transfers are ignored."""
         transfer = self._transfer
         if transfer is None or cob_id != 0x580 + transfer.request.node:
             return

@@ -77,7 +77,7 @@ class SdoSniffer:
         self.changes += 1
 
     def request(self, data: bytes, now_s: float) -> None:
-        """Take a frame of the master, 0x600 + node."""
+        """Process a frame of the master, 0x600 + node."""
         if len(data) != 8:
             return
         if self._goes_on(data, now_s):
@@ -101,7 +101,7 @@ class SdoSniffer:
             self._dispute(transfer.address)
 
     def response(self, data: bytes, now_s: float) -> tuple[Address, bytes] | None:
-        """Take a frame of the node, 0x580 + node; return the object of interest that it ends to read."""
+        """Process a frame of the node, 0x580 + node; return the object of interest that it ends to read."""
         transfer = self._transfer
         if len(data) != 8 or self._blocks:
             return None
@@ -116,7 +116,7 @@ class SdoSniffer:
         return None
 
     def _goes_on(self, data: bytes, now_s: float) -> bool:
-        """Whether a frame of the master belongs to a block download: its segments look like any request."""
+        """Return whether the master's frame belongs to a block download: its segments look like requests."""
         if now_s - self._block_s > self._timeout_s:
             return False
         ended = data[0] == _ABORT << 5 or (self._last_segment and data[0] & 0xE3 == 0xC1)
@@ -125,7 +125,7 @@ class SdoSniffer:
         return True
 
     def _accept(self, transfer: _Transfer, data: bytes) -> tuple[Address, bytes] | None:
-        """Take the answer that is due."""
+        """Accept the answer that is due."""
         command = data[0] >> 5
         transfer.due, transfer.answer = None, data
         if command == _ABORT:
@@ -140,7 +140,7 @@ class SdoSniffer:
         return None
 
     def _repeated(self, transfer: _Transfer, data: bytes) -> None:
-        """Take a further answer to a request."""
+        """Compare a further answer to a request."""
         if data == transfer.answer:
             return
         self.unasked += 1
@@ -191,14 +191,14 @@ def _begun(data: bytes, now_s: float) -> _Transfer:
 
 
 def _may_follow(transfer: _Transfer, data: bytes) -> bool:
-    """Whether a request is the next segment: the answer before it has come, and the toggle bit alternates."""
+    """Return whether a request is the next segment: answered before, and with the other toggle bit."""
     wanted = _DOWNLOAD_SEGMENT if transfer.writing else _UPLOAD_SEGMENT
     ready = transfer.segmented and transfer.due is None and not transfer.ended
     return ready and data[0] >> 5 == wanted and data[0] & _TOGGLE != transfer.toggle
 
 
 def _names(transfer: _Transfer, data: bytes) -> bool:
-    """Whether an answer names the object, or the segment, of the present request."""
+    """Return whether an answer names the object, or the segment, of the present request."""
     if data[0] >> 5 in (_SEGMENT_SENT, _SEGMENT_TAKEN):
         return transfer.segmented and data[0] & _TOGGLE == transfer.toggle
     return _address(data) == transfer.address

@@ -93,7 +93,7 @@ class _Drive:
     def _choose(
         self, what: str, key: str, stated: float | None, reported: float | None, source: str
     ) -> float | None:
-        """The declared value, else the reported one; a finding if they disagree."""
+        """Return the declared value, else the reported one; a finding if they disagree."""
         if stated is None or reported is None:
             return reported if stated is None else stated
         if not math.isclose(stated, reported, rel_tol=_SAME):

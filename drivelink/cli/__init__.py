@@ -111,7 +111,7 @@ class Verb(Protocol):
 
     @staticmethod
     def run(args: argparse.Namespace) -> int:
-        """Do the job; return the exit status."""
+        """Run the verb; return the exit status."""
 
 
 def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
@@ -176,7 +176,7 @@ def _main(argv: list[str] | None) -> int:
 
 
 def _verb_parser(parser: argparse.ArgumentParser, verb: str) -> argparse.ArgumentParser:
-    """The parser of one verb."""
+    """Return the parser of one verb."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction) and verb in action.choices:
             return action.choices[verb]  # type: ignore[no-any-return]
@@ -313,7 +313,7 @@ def handling(
     handler: Callable[[int, FrameType | None], object],
     numbers: Iterable[int] = (signal.SIGINT, signal.SIGTERM),
 ) -> Iterator[None]:
-    """Have signals handled while a block runs, and as before after it."""
+    """Handle signals while a block runs, and as before after it."""
     before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
@@ -323,7 +323,7 @@ def handling(
 
 
 def _instead_of_a_name(error: DrivelinkError) -> str:
-    """What to give where a joint file is expected and a joint's name was given; empty where none was."""
+    """Return what to give instead of a joint's name where its file is expected; empty: no name was given."""
     cause = error.__cause__
     if not (isinstance(error, JointFileError) and isinstance(cause, FileNotFoundError)):
         return ""

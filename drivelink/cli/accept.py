@@ -36,7 +36,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     say = (lambda _: None) if args.json else print
     if args.undo:
         old = undo(args.joint)
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _asked() -> bool:
-    """Whether the person at the terminal says yes."""
+    """Return whether the person at the terminal says yes."""
     if not sys.stdin.isatty():
         return False
     try:

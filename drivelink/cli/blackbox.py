@@ -33,7 +33,7 @@ _AGAIN_S = 5.0  # after which one that was killed is started again
 
 @contextmanager
 def black_box(joint: JointFile, path: Path | None, *, quiet: bool = False) -> Iterator[None]:
-    """The black box of a joint in a process, if its joint file asks for one; it ends with this process."""
+    """Start the black box of a joint in a process, if its joint file asks for one; it ends with this one."""
     if joint.recording.folder is None or path is None:
         yield
         return

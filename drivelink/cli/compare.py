@@ -38,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     for path in (args.a, args.b):
         if not path.exists():
             raise RecordingError(f"{path}: no such file")

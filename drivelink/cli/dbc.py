@@ -26,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     if args.source.suffix == ".toml":
         source = jointfile.load_text(args.source)
         layouts = known_layouts(source)

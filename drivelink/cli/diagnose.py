@@ -61,7 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     require_distinct([*args.recording, *([args.validate] if args.validate else [])])
     joint_of(args.recording[0], args.joint)  # its error comes first
     inputs = [path for path in (*args.recording, args.validate, args.joint) if path is not None]

@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _by_hand(joint: JointFile | None, args: argparse.Namespace, seconds: float) -> int:
-    """Lead through the checks; return 1 if a sign or scale is wrong or nothing was checked."""
+    """Guide through the checks; return 1 if a sign or scale is wrong or nothing was checked."""
     if joint is None:
         raise UsageError("--move: expected a joint file")
     with live_values(joint, args.joint.parent) as values:

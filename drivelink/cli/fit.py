@@ -40,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     folder = args.out if args.plots == Path() else args.plots
     if args.plots == Path() and args.out is None:
         raise UsageError("--plots: expected a folder, or --out to put the plots into")

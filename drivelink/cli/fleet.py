@@ -86,7 +86,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     missing = [name for name in _NEEDS if importlib.util.find_spec(name) is None]
     if missing:
         raise UsageError(
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _settings(args: argparse.Namespace) -> Settings:
-    """The settings of a run.
+    """Return the settings of a run.
 
     Raises:
         UsageError: an option is wrong, or the folder of joints is missing.

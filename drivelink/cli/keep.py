@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     wish = wish_of(jointfile.load_text(args.joint))
     folder = wish.parent
     try:
@@ -75,7 +75,7 @@ def _until(condition: Callable[[], bool], limit_s: float) -> bool:
 
 
 def _answer(wish: Path) -> str | None:
-    """What the black box says of a wish that it took: empty, not yet; None: it ended, or had no room."""
+    """Return the black box's answer to a wish; empty: not yet; None: it ended, or had no room."""
     try:
         return taken(wish).read_text().strip()
     except FileNotFoundError:

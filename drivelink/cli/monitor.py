@@ -83,7 +83,7 @@ def add_zenoh(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     if args.web and args.json:
         raise UsageError("expected either --web or --json")
     acceptance = None
@@ -145,7 +145,7 @@ def _where(args: argparse.Namespace) -> tuple[str | None, str, Path | None, str]
 
 
 def _is_file(name: str) -> bool:
-    """Whether a joint is named by its file."""
+    """Return whether a joint is named by its file."""
     return name.endswith(".toml") or "/" in name
 
 

@@ -132,7 +132,7 @@ def _next(args: argparse.Namespace, path: Path) -> str:
 
 
 def _case_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
-    """A copy of the shipped joint file with its comments, changed by the options."""
+    """Return a copy of the shipped joint file with its comments, changed by the options."""
     source = resources.files("drivelink") / "joints" / f"{args.case}.toml"
     document: Any = tomlkit.parse(source.read_text(encoding="utf-8"))
     if args.name:
@@ -237,7 +237,7 @@ def _ask(answers: Answers, known: set[str]) -> None:
 
 
 def _check(option: str) -> Callable[[str], Any]:
-    """What makes a value of the text that an option may be given."""
+    """Return what makes a value of the text that an option may be given."""
     parser = argparse.ArgumentParser()
     configure(parser)
     action = next(one for one in parser._actions if one.dest == option)

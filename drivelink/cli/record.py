@@ -73,7 +73,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     source = jointfile.load_text(args.joint)
     source = replace(source, joint=moved(source.joint, args))
     joint = source.joint
@@ -152,7 +152,7 @@ def _bus_wanted(sink: Sink, source: str, alive: bool, joint: JointFile) -> bool:
 
 
 def _alive(session: zenoh.Session, joint: JointFile) -> bool:
-    """Whether a daemon serves the joint now."""
+    """Return whether a daemon serves the joint now."""
     key = f"{joint.zenoh.prefix}/{joint.name}/alive"
     end = time.monotonic() + _ALIVE_S
     while time.monotonic() < end:
@@ -165,7 +165,7 @@ def _alive(session: zenoh.Session, joint: JointFile) -> bool:
 def _daemon(
     source: JointText, stack: ExitStack, *, needed: bool
 ) -> tuple[zenoh.Session | None, bool, Sequence[NodeLayout]]:
-    """A session that ends with the stack, whether a daemon serves the joint, and its mapping of the nodes.
+    """Return a session that ends with the stack, whether a daemon serves the joint, and its nodes' mapping.
 
     Raises:
         ZenohError: there is no session, and it is needed.
@@ -235,7 +235,7 @@ class _Summary:
         return next((tap.missing for tap in taps if isinstance(tap, BusTap) and tap.missing), "")
 
     def tick(self) -> None:
-        """Called each second: rewrite one line on a terminal, print an occasional line elsewhere."""
+        """Rewrite one line each second on a terminal, print an occasional line elsewhere."""
         if sys.stderr.isatty():
             print(f"\r\x1b[K{self._path}: {self.text()}, Ctrl-C ends ", end="", file=sys.stderr, flush=True)
         elif time.monotonic() >= self._next:

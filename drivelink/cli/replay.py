@@ -67,7 +67,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     source = joint_of(args.file, args.joint)
     joint, base_dir = source.joint, source.folder
     names = parse_column_map(args.map)

@@ -56,7 +56,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the job; return the exit status."""
+    """Run the verb; return the exit status."""
     root = args.root or Path("/")
     if args.root is None and os.geteuid() != 0:
         raise UsageError("service: writes below /etc: run it with sudo, or name a folder with --root")
@@ -127,7 +127,7 @@ def _uninstall(args: argparse.Namespace, root: Path) -> int:
 
 
 def _executable() -> Path:
-    """The installed program by its permanent path."""
+    """Return the installed program by its permanent path."""
     beside = Path(sys.executable).with_name("drivelink")
     found = beside if beside.exists() else Path(shutil.which("drivelink") or "")
     if not found.is_file():

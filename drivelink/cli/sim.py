@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _moving(joint: JointFile, motion: Path) -> JointFile:
-    """The joint with a simulation whose motors follow a motion."""
+    """Return the joint with a simulation whose motors follow a motion."""
     table = {"kind": "motion", "file": str(motion.absolute())}
     section = (joint.sim or SimSection()).model_copy(update={"excitation": table})
     return joint.model_copy(update={"sim": section})

@@ -67,7 +67,7 @@ class MapFollower:
         return self.refused
 
     def feed(self, cob_id: int, data: bytes, now_s: float, ahead: int = 0) -> None:
-        """Take a frame, in bus order.
+        """Process a frame, in bus order.
 
         Args:
             now_s: time by any clock, for the SDO time-out.
@@ -93,7 +93,7 @@ class MapFollower:
                 assembler.distrust(cob_id - 0x600)
 
     def sync(self) -> Sequence[Mismatch]:
-        """Take a SYNC, after the assemblers: new mappings apply from here on.
+        """Process a SYNC, after the assemblers: new mappings apply from here on.
 
         Returns:
             What nodes have said by SDO that contradicts what is in use.

@@ -184,7 +184,7 @@ class CycleLoop:
         self._sync(b"", stamp_ns, jump, now, 0 if deadline_ns is None else now - deadline_ns)
 
     def receive(self) -> None:
-        """Take and process the received frames."""
+        """Process the received frames."""
         try:
             frames = self.source.receive()
         except BusLostError as error:
@@ -317,7 +317,7 @@ class CycleLoop:
         self.on_lost(str(error))
 
     def carry_on(self) -> None:
-        """Without SYNC, mark the last estimates as stale."""
+        """Mark the last estimates as stale, without SYNC."""
         self.silent = True
         for loop_joint in self.loop_joints:
             tick = loop_joint.pipeline.carry_on(loop_joint.pipeline.assembler.sequence)

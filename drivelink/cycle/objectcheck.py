@@ -99,7 +99,7 @@ class RecentSamples:
         self._samples: deque[Sample] = deque(maxlen=round(HISTORY_S / period_s))
 
     def add(self, sample: Sample) -> None:
-        """Take the next one."""
+        """Add the next one."""
         self._samples.append(sample)
 
     def after(self, sequence: int, most: int) -> list[Sample]:
@@ -121,7 +121,7 @@ class ObjectCheck:
         self._nodes: dict[int, _Node] = {}
 
     def watch(self, layout: NodeLayout, assembler: Assembler) -> None:
-        """Begin with a node that has been configured."""
+        """Start checking a node that has been configured."""
         node_id, before = layout.node_id, self._nodes.get(layout.node_id)
         objects = _objects(layout)
         node = self._nodes[node_id] = _Node(
@@ -156,19 +156,19 @@ class ObjectCheck:
         return any(answer.address == one.address for answer in self._nodes[one.node].answers)
 
     def request(self, node: int, data: bytes, now_s: float) -> None:
-        """Take an SDO frame of a master."""
+        """Process an SDO frame of a master."""
         if node in self._nodes:
             self._nodes[node].asked = self._nodes[node].assembler.sequence
             self._nodes[node].sniffer.request(data, now_s)
 
     def response(self, node_id: int, data: bytes, now_s: float) -> None:
-        """Take an SDO frame of a node."""
+        """Process an SDO frame of a node."""
         node = self._nodes.get(node_id)
         if node is not None and (read := node.sniffer.response(data, now_s)) is not None:
             node.answers.append(_Answer(*read, node.asked, node.assembler.sequence))
 
     def sync(self) -> list[Mismatch]:
-        """Take a SYNC, after the assemblers; return what has become sure.
+        """Process a SYNC, after the assemblers; return what has become sure.
 
         The node's frames are not used until it is configured again.
         """
@@ -215,7 +215,7 @@ def _judge(node: _Node, answer: _Answer) -> Mismatch | None:
 
 
 def _unit_text(one: _Object, answer: _Answer) -> str:
-    """What an answer contradicts; empty: nothing."""
+    """Return what an answer contradicts; empty: nothing."""
     number = int.from_bytes(answer.data, "little")
     return (
         ""
@@ -225,7 +225,7 @@ def _unit_text(one: _Object, answer: _Answer) -> str:
 
 
 def _value_text(node: _Node, one: _Object, mapped: MappedObject, pick: Pick, answer: _Answer) -> str | None:
-    """What an answer contradicts; empty: nothing; None: there is too little to be compared."""
+    """Return what an answer contradicts; empty: nothing; None: there is too little to be compared."""
     data, size, before = answer.data, (mapped.bits + 7) // 8, max(answer.asked - _AROUND - 1, node.since)
     samples = node.samples(before, answer.answered + _AROUND - before)
     places = [(pick(sample) + mapped.offset) / mapped.scale for sample in samples]
@@ -247,7 +247,7 @@ def _name(one: _Object) -> str:
 
 
 def _objects(layout: NodeLayout) -> dict[Address, _Object]:
-    """What a sample has of a node's frames, and the units that it was configured by."""
+    """Return what a sample has of a node's frames, and the units that it was configured by."""
     motor, node = layout.motor or 0, layout.node_id
     picks: dict[Signal, Pick] = {
         Signal.MOTOR_POSITION: lambda sample: sample.motor_position_rad[motor],
@@ -286,14 +286,14 @@ class ReadBack:
         self._quiet_s = now_s + _FOREIGN_S
 
     def feed(self, node: int, data: bytes, now_s: float) -> None:
-        """Take an SDO frame of a node."""
+        """Process an SDO frame of a node."""
         if self._session.asks != node:
             self.quiet(now_s)
         else:
             self._session.feed(0x580 + node, data, now_s)
 
     def step(self, now_s: float) -> None:
-        """Let time pass."""
+        """Ask for what is due."""
         self._now_s = now_s
         self._session.poll(now_s)
 

@@ -22,7 +22,7 @@ class ResidualMonitor(Protocol):
     """Interface of the model monitor."""
 
     def step(self, sample: Sample, estimate: Estimate, residual_nm: float) -> bool:
-        """Take a sample; return whether the alarm is on."""
+        """Process a sample; return whether the alarm is on."""
 
     def describe(self) -> dict[str, Any]:
         """Return the residual against its baseline and likely location, for the status key."""

@@ -190,7 +190,7 @@ class VirtualSource(BusSource):
             return None
 
     def send(self, cob_id: int, data: bytes) -> None:
-        """Give every other bus of the channel its own message: python-can would deep-copy."""
+        """Send every other bus of the channel its own message: python-can would deep-copy."""
         self._check()
         stamp_s = time.time()
         for receiver in self._channel:

@@ -31,7 +31,7 @@ class BusPort:
         self.loop: CycleLoop | None = None  # the only reader, once it runs
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Put a frame on the bus."""
+        """Send a frame."""
         if self.loop is None:
             self.bus.send(msg, timeout)
         else:
@@ -89,7 +89,7 @@ def join_bus(
 
 
 def _timed(section: BusSection, stamps_ns: Sequence[int]) -> BusSection:
-    """The bus section with the measured period of the master's SYNC."""
+    """Return the bus section with the measured period of the master's SYNC."""
     measured = measure_period(stamps_ns, section.period_s)
     if measured is None or measured.same:
         return section
@@ -119,7 +119,7 @@ def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[
 def _patiently(
     port: BusPort, idle: Idle | None, patience_s: float, lacking: Callable[[], str]
 ) -> Iterator[tuple[int, bytes, int]]:
-    """The same without end; what is lacking after a while is said once."""
+    """Wait for the same without end; what is lacking after a while is said once."""
     yield from _frames(port, idle, patience_s)
     if text := lacking():
         logger.warning("waiting for another master: %s", text)
@@ -144,7 +144,7 @@ def _listen(port: BusPort, passive: PassiveConfigurator, idle: Idle | None, pati
 
 
 def _overhear(passive: PassiveConfigurator, cob_id: int, data: bytes) -> bool:
-    """Take a frame; return whether it has changed the layout of a node."""
+    """Process a frame; return whether it has changed the layout of a node."""
     now_s = time.monotonic()
     if cob_id >= 0:
         passive.feed(cob_id, data, now_s)

@@ -83,7 +83,7 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
 
 
 def _agree(places: FloatArray) -> bool:
-    """Whether times, in periods, have a common phase: Rayleigh's test against any phase at all."""
+    """Return whether times, in periods, have a common phase: Rayleigh's test against any phase at all."""
     return bool(np.abs(np.mean(np.exp(2j * np.pi * places))) ** 2 * places.size > -math.log(_CHANCE))
 
 

@@ -71,12 +71,12 @@ class Reloader:
         self._requested = True
 
     def close(self) -> JointFile:
-        """Give up a reload that is under way; return the joint file in use."""
+        """Cancel a reload that is under way; return the joint file in use."""
         self._thread = None
         return self._joint
 
     def check(self) -> None:
-        """In the slack: start a reload if the file has changed."""
+        """Start a reload in the slack, if the file has changed."""
         if self._thread is not None or time.monotonic() < self._next_s:
             return
         signature = self._signature()
@@ -88,7 +88,7 @@ class Reloader:
         self._thread.start()
 
     def step(self, _now_ns: int) -> None:
-        """In the slack, between two cycles: swap in the new estimator when it is ready."""
+        """Swap in the new estimator when it is ready, in the slack between two cycles."""
         if self._ready is None or not self._turn.acquire(blocking=False):
             return
         try:
@@ -153,7 +153,7 @@ class Reloader:
 
 
 def _fixed(joint: JointFile) -> dict[str, object]:
-    """What a running daemon cannot change, by key."""
+    """Return what a running daemon cannot change, by key."""
     keys = ("bus", "zenoh", "recording")
     drives = {f"motor[{n}].drive": motor.drive for n, motor in enumerate(joint.motor, 1)}
     return {key: getattr(joint, key) for key in keys} | drives | {"link.encoder": joint.link.encoder}

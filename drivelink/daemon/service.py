@@ -303,7 +303,7 @@ class Daemon:
             housekeeping.every(watchdog_s, Watchdog(self.loop).check)
 
     def _timed(self, joint: JointFile) -> JointFile:
-        """A joint file with the measured period of SYNC."""
+        """Return a joint file with the measured period of SYNC."""
         return joint.model_copy(update={"bus": self._section})
 
     def _republish(

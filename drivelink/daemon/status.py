@@ -75,7 +75,7 @@ class EventLog:
             self.end(key, over)
 
     def _limited(self, key: str, source: str) -> str:
-        """The key, or the source's own where it has made too many different events."""
+        """Return the key, or the source's own where it has made too many different events."""
         if not source:
             return key
         now = self._clock()

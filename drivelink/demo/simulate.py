@@ -121,7 +121,7 @@ def _assumed_stiffness(motor: MotorSection) -> float:
 
 
 def _spring(motor: MotorSection, index: int) -> Spring:
-    """The declared transmission; without parameters one that suits the motor."""
+    """Return the declared transmission; without parameters one that suits the motor."""
     transmission = motor.transmission
     if transmission.model == "none" or transmission.parameters:
         return Spring(model=transmission.model, parameters=transmission.parameters)
@@ -134,7 +134,7 @@ def _spring(motor: MotorSection, index: int) -> Spring:
 
 
 def _plant(joint: JointFile) -> JointPlant:
-    """The declared joint; without link dynamics the link has twice the first motor's inertia."""
+    """Return the declared joint; without link dynamics the link has twice the first motor's inertia."""
     link = joint.link.dynamics or LinkDynamics(inertia_kg_m2=2.0 * joint.motor[0].inertia_kg_m2)
     return JointPlant(
         arrangement=joint.arrangement,
@@ -176,7 +176,7 @@ def _asked(effects: Sequence[str]) -> list[PlantEffect]:
 def _excitation(
     section: SimSection, plant: JointPlant, given: Case | None, file: Path | None
 ) -> Mapping[str, Any]:
-    """The file's table, completed for the case or the plant; a motion's file lies beside the joint file."""
+    """Return the file's table, completed for the case or plant; a motion's file is beside the joint file."""
     table = section.excitation
     if table.get("kind") == "motion":
         folder = Path() if file is None else file.parent
@@ -191,7 +191,7 @@ def _excitation(
 
 
 def _hardware(joint: JointFile, index: int, plant: JointPlant, given: Case | None) -> DriveHardware:
-    """The drive of one motor: declared values, completed by the case or by plausible values."""
+    """Return the drive of one motor: declared values, completed by the case or by plausible values."""
     drive = joint.motor[index].drive
     assumed = given.drives[index] if given else DriveHardware()
     if drive is None:

@@ -108,7 +108,7 @@ class DemoRun:
             self._other(message)
 
     def _other(self, message: Any) -> None:
-        """Take what a rig says besides."""
+        """Process what a rig says besides."""
 
     def _take(self, subscription: Subscription) -> None:
         for estimate in subscription.cycles(0.0):

@@ -50,7 +50,7 @@ def examine_interface(section: Section, bus: BusSection) -> None:
 
 
 def _links() -> dict[str, dict[str, Any]]:
-    """The system's network interfaces, by name."""
+    """Return the system's network interfaces, by name."""
     command = ["ip", "-json", "-details", "-statistics", "link", "show"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)

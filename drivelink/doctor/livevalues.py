@@ -138,7 +138,7 @@ class Heard:
         return self._frames.missing or "no SYNC, or not all of its frames"
 
     def feed(self, message: can.Message) -> None:
-        """Take a frame, in bus order."""
+        """Process a frame, in bus order."""
         if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
             stamp_ns = round((message.timestamp or time.time()) * 1e9)
             frame = LoggedFrame(stamp_ns, message.arbitration_id, bytes(message.data), "")
@@ -242,7 +242,7 @@ class LiveValues:
         self._collect = collect
 
     def read(self, seconds: float) -> Mapping[str, Value]:
-        """Mean and standard deviation over the next seconds: "motor1_position", …, "link_position".
+        """Return mean and standard deviation over the next seconds: "motor1_position", …, "link_position".
 
         Raises:
             DriveError: a node does not answer.
@@ -258,7 +258,7 @@ class LiveValues:
 
 @contextmanager
 def live_values(joint: JointFile, base_dir: Path) -> Iterator[LiveValues]:
-    """The channels of a joint on its bus.
+    """Return the channels of a joint on its bus.
 
     Raises:
         BusError: the bus cannot be opened.

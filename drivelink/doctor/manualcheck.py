@@ -127,7 +127,7 @@ class ByHand:
 
 
 def check_by_hand(joint: JointFile, values: Values, person: Person, seconds: float = 0.3) -> ByHand:
-    """Lead a person through the checks.
+    """Guide a person through the checks.
 
     Args:
         seconds: over which a channel at rest is averaged.
@@ -199,11 +199,11 @@ class _Steps:
             self.done.needed[channel.replace("position", "torque")] = ratio
 
     def _is_gear(self, ratio: float) -> bool:
-        """Whether a scale is wrong by an undeclared gear rather than a unit."""
+        """Return whether a scale is wrong by an undeclared gear rather than a unit."""
         return ratio > _GEARED and abs(math.log(ratio * self._axis.everyday)) > _BY_EYE
 
     def _gear_twice(self, ratio: float, channel: str) -> bool:
-        """Whether a motor's motion is too small by its declared gear."""
+        """Return whether a motor's motion is too small by its declared gear."""
         drive = self._joint.motor[int(channel[5]) - 1].drive
         gear = 1.0 if drive is None else drive.gear_ratio
         return gear > _GEARED and abs(ratio * gear - 1.0) < _BY_EYE
@@ -285,7 +285,7 @@ class _Steps:
         self._person.show(f"  {mark}")
 
     def _amount(self, text: str) -> float | None:
-        """The amount of motion, rad or m; None: skipped."""
+        """Return the amount of motion, rad or m; None: skipped."""
         axis = self._axis
         while True:
             reply = self._ask(text)
@@ -300,7 +300,7 @@ class _Steps:
             self._person.show(f"expected an amount like {axis.example}, got {reply}")
 
     def _torque(self, text: str) -> float | None:
-        """The torque or force of the push, N·m or N; None: unknown."""
+        """Return the torque or force of the push, N·m or N; None: unknown."""
         while True:
             reply = self._ask(text)
             if not reply:

@@ -48,7 +48,7 @@ def judge_record(section: Section, joint: JointFile, record: Record | None) -> N
 
 
 def _advice(record: Record) -> str:
-    """What would decide what could not be decided."""
+    """Return what would decide what could not be decided."""
     if len(record) < (1.0 - _MOST_LOST) * (record.sequence[-1] - record.sequence[0] + 1):
         return _LOST
     for position in record.motor_position_rad.T:
@@ -120,7 +120,7 @@ def _windows(times: Sequence[float]) -> list[tuple[int, int]]:
 
 
 def _slope(x: Sequence[float], y: Sequence[float]) -> float:
-    """The least-squares factor k of y = k x."""
+    """Return the least-squares factor k of y = k x."""
     square = float(np.dot(x, x))
     return float(np.dot(x, y)) / square if square else 0.0
 

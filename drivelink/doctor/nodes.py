@@ -242,7 +242,7 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
 
 
 def _has_all(section: Section, role: Role, survey: NodeSurvey, wanted: Available) -> bool:
-    """Whether the node has an object for each signal that is needed; say those that it lacks."""
+    """Return whether the node has an object for each signal that is needed; say those that it lacks."""
     complete = True
     for signal, candidates in wanted.items():
         if not candidates:

@@ -38,7 +38,7 @@ class Report:
     fine: str = "no problem found"  # summary without findings
 
     def section(self, title: str) -> Section:
-        """Begin a section."""
+        """Start a section."""
         self.sections.append(Section(title))
         return self.sections[-1]
 

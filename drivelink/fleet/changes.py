@@ -176,7 +176,7 @@ def _projected(design: FloatArray, rows: FloatArray, weight: FloatArray) -> Floa
 def _strongest(
     shapes: _Shapes, value: FloatArray, weight: FloatArray, design: FloatArray, enough: float = 0.0
 ) -> tuple[float, list[int]]:
-    """The shape, or pair of steps, that is most significant beside a design, and its bounded p value.
+    """Return the shape, or pair of steps, that is most significant beside a design, and its bounded p value.
 
     A pair is not looked for where one shape is significant at the level `enough`.
     """
@@ -238,7 +238,7 @@ def _independent(residual: FloatArray) -> float:
 def _change(
     shapes: _Shapes, place: int, row: int, design: FloatArray, value: FloatArray, weight: FloatArray
 ) -> SeriesChange:
-    """A chosen shape with its size beside the others, and the places that fit as well."""
+    """Return a chosen shape with its size beside the others, and the places that fit as well."""
     n, used = len(value), len(design)
     normal = (design * weight) @ design.T
     solution = np.linalg.solve(normal, (design * weight) @ value)

@@ -43,7 +43,7 @@ class Joint:
 
     @contextmanager
     def base_dir(self) -> Iterator[Path]:
-        """A folder with the files that the joint file refers to."""
+        """Provide a folder with the files that the joint file refers to."""
         if not self.eds:
             yield Path(self.where).parent
             return
@@ -137,7 +137,7 @@ def carried_joint(path: Path) -> Joint | None:
 
 
 def _stands_in(name: str, text: str) -> bool:
-    """Whether a text contains a name as whole words."""
+    """Return whether a text contains a name as whole words."""
     return re.search(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])", text) is not None
 
 

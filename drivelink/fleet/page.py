@@ -205,7 +205,7 @@ def _figure(joint: dict[str, Any], one: dict[str, Any]) -> str:
 
 
 def _missing(joint: dict[str, Any], one: dict[str, Any], frame: _Frame, *, linked: bool = True) -> str:
-    """A cross for each recording that shows no stiffness of this transmission."""
+    """Return a cross for each recording that shows no stiffness of this transmission."""
     parts = []
     for row in joint["unusable"]:
         if row["transmission"] not in (None, one["transmission"]):
@@ -219,7 +219,7 @@ def _missing(joint: dict[str, Any], one: dict[str, Any], frame: _Frame, *, linke
 
 
 def _frame(joint: dict[str, Any], one: dict[str, Any], left: float, width: float, height: float) -> _Frame:
-    """The range of the values, and the time of all recordings of the joint, usable or not."""
+    """Return the range of the values, and the time of all recordings of the joint, usable or not."""
     points = one["series"]
     values = [p["fitted_nm_rad"] for p in points]
     values += [p["stiffness_nm_rad"] + d * p["std_nm_rad"] for p in points for d in (-SIGMA_95, SIGMA_95)]
@@ -282,7 +282,7 @@ def _points(one: dict[str, Any], frame: _Frame) -> str:
 
 
 def _strip(joint: dict[str, Any], effect: dict[str, Any], frame: _Frame, y: float) -> str:
-    """One line below the chart: recordings in which an effect was found at a location."""
+    """Return one line below the chart: recordings in which an effect was found at a location."""
     kind = "found new" if effect["significant"] else "found"
     place = html.escape(spaced(effect["location"]))
     parts = [f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{place}</text>']

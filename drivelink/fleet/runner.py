@@ -112,7 +112,7 @@ def run(
 
 
 def _wanted(source: Source, joints: Joints, table: FleetTable, settings: Settings, counts: Counts) -> bool:
-    """Whether a recording needs processing, by its listing."""
+    """Return whether a recording needs processing, by its listing."""
     latest = named_time(source) or source.modified
     if settings.since and latest and latest < settings.since:
         counts.early += 1
@@ -248,7 +248,7 @@ def _local(settings: Settings, tasks: int) -> Iterator[Client]:
 
 
 def _remote(address: str, insecure: bool) -> Client:
-    """A client of a running scheduler; certificates are those of Dask's configuration.
+    """Return a client of a running scheduler; certificates are those of Dask's configuration.
 
     Raises:
         FleetError: without TLS and not `insecure`, without certificates, or not reached.
@@ -294,7 +294,7 @@ def _worker_version() -> str:
 
 
 def _previous(sources: list[Source], joints: Joints, shared: Any, client: Client) -> dict[str, Source]:
-    """The previous recording of the same joint, by address.
+    """Return the previous recording of the same joint, by address.
 
     Workers read joint and time of MCAP files; others are known by name and date.
     """

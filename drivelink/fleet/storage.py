@@ -132,7 +132,7 @@ def _checked(what: str) -> Iterator[None]:
 
 
 def _url(pattern: str, fs: Any, path: str) -> str:
-    """The address of a listed file: file systems omit protocol and sometimes host."""
+    """Return the address of a listed file: file systems omit protocol and sometimes host."""
     if "://" in path:
         return path
     if "://" not in pattern or pattern.startswith(("file://", "local://")):
@@ -148,7 +148,7 @@ def _line(error: BaseException) -> str:
 
 @contextmanager
 def fetched(source: Source) -> Iterator[tuple[Path, str]]:
-    """A recording as a local file, with the SHA-256 of its content; a remote one is copied.
+    """Provide a recording as a local file, with the SHA-256 of its content; a remote one is copied.
 
     Raises:
         OSError: it cannot be read.

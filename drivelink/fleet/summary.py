@@ -68,7 +68,7 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
     q_of = dict(zip(p, found, strict=True))
 
     def judged(one: Series | _Place) -> tuple[float, float]:
-        """Its q, and the level at which changes are looked for; 0: there is none."""
+        """Return its q, and the level at which changes are looked for; 0: there is none."""
         q = q_of.get(id(one), 1.0)
         return q, level if q <= false_discovery_rate else 0.0
 

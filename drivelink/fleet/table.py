@@ -168,7 +168,7 @@ class FleetTable:
 
 
 def _current(rows: list[dict[str, Any]]) -> list[bool]:
-    """Whether each row is the newest of its content and, if it is an error, of its recording."""
+    """Return whether each row is the newest of its content and, if it is an error, of its recording."""
     of_content: dict[_Key, datetime] = {}
     of_place: dict[str, datetime] = {}
     for row in rows:
@@ -219,12 +219,12 @@ def _bytes(table: Any) -> bytes:
 
 
 def _new_part() -> str:
-    """The name of a new part; names sort in order of writing."""
+    """Return the name of a new part; names sort in order of writing."""
     return f"{FOLDER}/part-{datetime.now(UTC):%Y%m%dT%H%M%S%f}-{uuid4().hex[:8]}.parquet"
 
 
 def _locked(store: Store) -> int | None:
-    """A lock for changing existing parts; None if another run has it.
+    """Return a lock for changing existing parts; None if another run has it.
 
     Remote storage has none: each run writes its own part.
     """

@@ -227,7 +227,7 @@ def _broken(row: dict[str, Any], error: str, notes: list[str], begin: float) -> 
 def _results(
     task: Task, joint: Joint, path: Path, row: dict[str, Any]
 ) -> tuple[list[dict[str, Any]], list[tuple[str, str]]]:
-    """The rows of a recording, and its reports."""
+    """Return the rows of a recording, and its reports."""
     rows, reports = [], []
     file, limit = joint.file, task.limit_bytes or _declared_limit()
     with joint.base_dir() as base, _validation(task, joint, base) as validation:

@@ -157,7 +157,7 @@ def _readings(outcome: Diagnosis, motor: int | None) -> list[Effect]:
 
 
 def _transmission(declared: Transmission, outcome: Diagnosis, motor: int) -> Transmission:
-    """The transmission with its refitted parameters; as declared if it is rigid or undetermined."""
+    """Return the transmission with its refitted parameters; as declared if it is rigid or undetermined."""
     found = outcome.transmissions[motor]
     if not found.parameters or not _decided(outcome):
         return declared

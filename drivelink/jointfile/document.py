@@ -94,7 +94,7 @@ def _keys(section: Any) -> dict[str, Any]:
 
 
 def _table(annotation: Any) -> Any:
-    """The table's schema in an annotation like `tuple[MotorSection, ...]` or `Section | None`."""
+    """Return the table's schema in an annotation like `tuple[MotorSection, ...]` or `Section | None`."""
     if _keys(annotation):
         return annotation
     found = (_table(argument) for argument in typing.get_args(annotation))
@@ -243,7 +243,7 @@ def _apart(text: str, before: str) -> str:
 
 
 def _checked(text: str) -> str:
-    """A joint file's text with its first line and its check line."""
+    """Return a joint file's text with its first line and its check line."""
     text = f"{_MARK}\n{text.rstrip()}\n"
     return f"{text}# drivelink check: sha256 {_digest(text)}\n"
 
@@ -287,14 +287,14 @@ def _merge(table: Any, changes: dict[str, Any], *, dotted: bool = False) -> None
 
 
 def _is_dotted(table: Any, key: str) -> bool:
-    """Whether a table is written as `key.name = …` instead of below a header."""
+    """Return whether a table is written as `key.name = …` instead of below a header."""
     container = table if isinstance(table, Container) else getattr(table, "value", None)
     body = container.body if isinstance(container, Container) else ()
     return any(k is not None and k.key == key and k.is_dotted() for k, _ in body)
 
 
 def _inline(value: Any) -> Any:
-    """A value without header."""
+    """Return a value without header."""
     if isinstance(value, dict):
         made = tomlkit.inline_table()
         for key, one in value.items():

@@ -122,7 +122,7 @@ def undo(path: Path) -> Path:
 
 
 def _model_lines(text: str) -> list[str]:
-    """A joint file without [provenance], where that is all that follows it."""
+    """Return a joint file without [provenance], where that is all that follows it."""
     lines = without_check(text).splitlines()
     begins = [k for k, line in enumerate(lines) if line.startswith("[")]
     others = [k for k in begins if not lines[k].lstrip("[").startswith("provenance")]
@@ -173,7 +173,7 @@ class Trial:
         self._last: object = None
 
     def update(self, status: Mapping[str, Any], model: Mapping[str, Any], now_s: float) -> bool | None:
-        """Take what the daemon says now; return `fallen`."""
+        """Process what the daemon says now; return `fallen`."""
         if self.fallen is not None:
             return self.fallen
         if not self.in_use and model and accepted_at(model) == self._accepted:

@@ -90,11 +90,11 @@ class BlackBox(Sink):
             raise RecordingError(f"{self._folder}: cannot be written: {error.strerror}") from error
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
-        """Take what was measured at one SYNC."""
+        """Store what was measured at one SYNC."""
         self._take("sample", sample, stamp_ns)
 
     def estimate(self, message: EstimateMessage) -> None:
-        """Take one estimate; its alarms are events."""
+        """Store one estimate; its alarms are events."""
         self._take("estimate", message)
         self._day.estimate(message)
         flags = message.status & _MASK
@@ -105,14 +105,14 @@ class BlackBox(Sink):
                     self.keep(cause)
 
     def external(self, message: ExternalMessage) -> None:
-        """Take one external torque; a contact is an event where that is asked for."""
+        """Store one external torque; a contact is an event where that is asked for."""
         self._take("external", message)
         begun, self._contact = message.contact and not self._contact, message.contact
         if begun and self._section.keep_contacts:
             self.keep("contact")
 
     def document(self, name: str, payload: bytes, stamp_ns: int) -> None:
-        """Take a JSON document; a suspected signal, a fault or a lost bus in a status is an event."""
+        """Store a JSON document; a suspected signal, a fault or a lost bus in a status is an event."""
         self._take("document", name, payload, stamp_ns)
         if name == "model":
             if self._model is not None and self._model[1] != payload:
@@ -136,15 +136,15 @@ class BlackBox(Sink):
         self._holding = holding
 
     def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
-        """Take one CAN frame."""
+        """Store one CAN frame."""
         self._take("frame", stamp_ns, cob_id, data)
 
     def snapshot(self, state: bytes) -> None:
-        """Take the estimator's state, with which a recording begins: a replay goes on from it."""
+        """Store the estimator's state, with which a recording begins: a replay goes on from it."""
         self._take("snapshot", state)
 
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
-        """Take the mapping document: every recording begins with it."""
+        """Store the mapping document: every recording begins with it."""
         self._mapping = (document, stamp_ns)
 
     def keep(self, cause: str, *, asked: bool = False) -> None:
@@ -182,11 +182,11 @@ class BlackBox(Sink):
             self._begin(self._event).join()
 
     def abandon(self) -> None:
-        """The same: what is in memory is worth keeping after an error, too."""
+        """Write what is in memory: it is worth keeping after an error, too."""
         self.close()
 
     def _reread(self) -> None:
-        """Take the joint file anew: the daemon has it in use when it publishes another model."""
+        """Read the joint file anew: the daemon has it in use when it publishes another model."""
         if self._text.path is not None:
             try:
                 self._text = load_text(self._text.path)

@@ -49,13 +49,13 @@ class Day:
         self._failed = False
 
     def estimate(self, message: EstimateMessage) -> None:
-        """Take one estimate."""
+        """Add one estimate."""
         self._newest = message
         self._all += 1
         self._valid += bool(message.status & Status.VALID)
 
     def status(self, document: Mapping[str, Any]) -> None:
-        """Take the friction of a status document: that of all motors together."""
+        """Add the friction of a status document: that of all motors together."""
         found = document.get("friction")
         known = [one for one in found if isinstance(one, Mapping)] if isinstance(found, list) else []
         if known and len(known) == len(found or ()):

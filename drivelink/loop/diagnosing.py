@@ -69,7 +69,7 @@ def summary(outcome: Diagnosis, error: Errors, joint: JointFile, better: bool) -
 
 
 def _of_link(outcome: Diagnosis) -> bool:
-    """Whether all that was found is in the link's balance alone (eq 4), where the motor's shows nothing."""
+    """Return whether all that was found is in the link's balance alone (eq 4), none in a motor's."""
     return bool(outcome.effects) and all(one.location == "link" for one in outcome.effects)
 
 
@@ -96,7 +96,7 @@ _TRAINED = 2 / 3  # of the data; the rest is held out
 
 
 def since(seconds: Sequence[Second]) -> tuple[int, int] | None:
-    """Begin and end of the second in which the residual rose, sequence numbers; None: not in this recording.
+    """Return the sequence numbers around the second in which the residual rose; None: not in this recording.
 
     Two levels of its logarithm explain it better than one, by the Bayesian information criterion.
     """
@@ -159,7 +159,7 @@ def make(recording: Path) -> dict[str, Any]:
 
 
 def _has_changed(part: Record, joint: JointFile, outcome: Diagnosis) -> bool:
-    """Whether an effect was found, or the model in use fails its own test."""
+    """Return whether an effect was found, or the model in use fails its own test."""
     if outcome.verdict != "sufficient":
         return outcome.verdict == "effect"
     return _alarms(part, joint)
@@ -171,7 +171,7 @@ def _alarms(part: Record, joint: JointFile) -> bool:
 
 
 def _change(part: Record, joint: JointFile, outcome: Diagnosis) -> Diagnosis:
-    """What is to change: nothing of motors that pass their own test, where what was found is on the link."""
+    """Return what is to change: of motors that pass their own test nothing, if the finding is the link's."""
     if not _of_link(outcome) or not can_monitor(joint.model()) or _alarms(part, joint):
         return outcome
     kept = tuple(replace(one, parameters={}, motor={}) for one in outcome.transmissions)
@@ -179,8 +179,8 @@ def _change(part: Record, joint: JointFile, outcome: Diagnosis) -> Diagnosis:
 
 
 def _error(part: Record, joint: JointFile, outcome: Diagnosis, held_from: int) -> Errors:
-    """The error on held-out data of the model in use and of the proposed one: of the motors, or of the link
-    where what was found is there.
+    """Return the error on held-out data of the model in use and of the proposed one: of the motors, or of the
+    link where what was found is there.
 
     Of a model without parameters, which is no model yet, the error before is that of its best fit.
     """

@@ -21,7 +21,7 @@ class _Feed:
     _thread: threading.Thread | None = None
 
     def check(self) -> None:
-        """In the slack: begin the work if it is due."""
+        """Start the work in the slack, if it is due."""
         if (self._thread is None or not self._thread.is_alive()) and self._due():
             self._thread = threading.Thread(target=self._work, name=type(self).__name__, daemon=True)
             self._thread.start()
@@ -65,7 +65,7 @@ class FindingFeed(_Feed):
         self._published: Mapping[str, Any] | None = None
 
     def check(self) -> None:
-        """In the slack: publish what was read; begin to read if the folder has changed."""
+        """Publish what was read, in the slack; start to read if the folder has changed."""
         if self._found is not None:
             found, self._found = self._found, None
             if found != self._published:

@@ -140,7 +140,7 @@ def begun(recording: Path, state: str, sentence: str) -> dict[str, Any]:
 
 
 def write(recording: Path, finding: Mapping[str, Any]) -> None:
-    """Put a finding beside its recording.
+    """Write a finding beside its recording.
 
     Raises:
         RecordingError: it cannot be written.

@@ -76,7 +76,7 @@ class Diagnoses:
             self._say(finding.FAILED, f"its diagnosis cannot be started: {error.strerror}")
 
     def _watch(self, pid: int) -> None:
-        """Say it while the processors are too busy for the diagnosis, and when it goes on."""
+        """Log it while the processors are too busy for the diagnosis, and when it goes on."""
         now_s, (state, cpu_s) = time.monotonic(), _of_process(pid)
         before_s, had_s = self._before
         self._before = now_s, cpu_s

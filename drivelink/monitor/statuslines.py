@@ -126,13 +126,13 @@ _TIMES = (("latency", "work"), ("response", "answer"), ("jitter", "late"))
 
 
 def _part(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """A mapping in a document; empty if it is not one."""
+    """Return a mapping in a document; empty if it is not one."""
     part = document.get(key)
     return part if isinstance(part, Mapping) else {}
 
 
 def _number(value: Any) -> float | None:
-    """A finite number of a document, which holds no other ones."""
+    """Return a finite number of a document, which holds no other ones."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
@@ -145,7 +145,7 @@ def _texts(value: Any) -> list[str]:
 
 
 def _node(name: str, node: Any) -> NodeState:
-    """One entry of `nodes`."""
+    """Return one entry of `nodes`."""
     if not isinstance(node, Mapping):
         return NodeState(_text(name), _text(node), False)
     state, fault = _text(node.get("state")), bool(node.get("fault"))
@@ -209,7 +209,7 @@ def _cycle(shown: Shown) -> str:
 
 
 def _residual(shown: Shown) -> str:
-    """The residual in words, with the improvement by diagnose."""
+    """Return the residual in words, with the improvement by diagnose."""
     if shown.ratio is not None:
         text = f"residual {number(shown.ratio, 2)} × baseline"
     elif shown.residual_nm is not None:

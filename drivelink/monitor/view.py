@@ -242,7 +242,7 @@ class JointView:
 
     @staticmethod
     def _legend() -> Table:
-        """The legend of the view."""
+        """Return the legend of the view."""
         table = Table.grid(padding=(0, 1, 0, 0))
         table.add_column(no_wrap=True, style="bold")
         table.add_column(overflow="fold")
@@ -323,7 +323,7 @@ class JointView:
         return self._time_plot(width, height, "stiffness over time, N·m/rad", moments, truth)
 
     def _last_plot(self, width: int, height: int) -> Text:
-        """The external torque where the link is known, else the residual."""
+        """Return the external torque where the link is known, else the residual."""
         if touches := self.history.touches:
             series = [(t.time_s, t.torque_nm, t.valid) for t in touches]
             return self._time_plot(width, height, "external torque over time, N·m", series)

@@ -154,11 +154,11 @@ class Watcher:
             self._claims.append(token)
 
     def _name(self, sample: zenoh.Sample) -> str:
-        """The joint's name from the key."""
+        """Return the joint's name from the key."""
         return str(sample.key_expr).removeprefix(self._prefix).split("/", 1)[0]
 
     def _joint(self, name: str) -> _Joint | None:
-        """The joint of that name; None if there are too many."""
+        """Return the joint of that name; None if there are too many."""
         joint = self._joints.get(name)
         if joint is None:
             if len(self._joints) >= MAX_JOINTS:

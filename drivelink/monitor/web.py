@@ -105,7 +105,7 @@ class WebView:
 
     @contextmanager
     def stream(self, signals: bool = False) -> Iterator[threading.Event]:
-        """A place among the streams; the event is set when a newer stream needs it, and at the end.
+        """Take a place among the streams; the event is set when a newer stream needs it, and at the end.
 
         Args:
             signals: it wants the motor signals as well.
@@ -224,7 +224,7 @@ def _signals(time_s: float, sample: Sample) -> list[Any]:
 
 
 def _describe(shown: Shown) -> dict[str, Any]:
-    """The rows of the status on the page."""
+    """Return the rows of the status on the page."""
     return {
         "cycle": [
             ("rate", shown.rate),
@@ -247,7 +247,7 @@ def _describe(shown: Shown) -> dict[str, Any]:
 
 
 def _finding(found: Mapping[str, Any]) -> dict[str, Any] | None:
-    """What the page shows of a finding; None without one."""
+    """Return what the page shows of a finding; None without one."""
     if not findings.line(found):
         return None
     texts = {key: str(found.get(key) or "") for key in ("state", "sentence", "cause", "recording")}

@@ -43,7 +43,7 @@ class WebAcceptance:
         return own and hmac.compare_digest(given, self.token.encode())
 
     def act(self, action: str, asked: Mapping[str, Any]) -> dict[str, Any]:
-        """Do what the page asks for; what goes wrong is `error`, in one line.
+        """Perform what the page asks for; what goes wrong is `error`, in one line.
 
         Args:
             asked: to accept, `recording`: the one whose proposal was shown.

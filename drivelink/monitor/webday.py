@@ -55,7 +55,7 @@ class WebDay:
         return json.dumps(document, allow_nan=False).encode()
 
     def _file(self, path: str) -> tuple[str, Path] | None:
-        """A kept recording or its diagnosis, by its name; None: there is none."""
+        """Return a kept recording or its diagnosis, by its name; None: there is none."""
         name = unquote(path).removeprefix("/kept/")
         try:
             recordings = kept(self._folder, self._joint)

@@ -180,7 +180,7 @@ def fit_plot(fits: Sequence[TransmissionFit], joint: JointFile) -> Figure:
 
 
 def _numbers(one: TransmissionFit, units: Units) -> list[str]:
-    """The parameters with their intervals."""
+    """Return the parameters with their intervals."""
     return [
         f"{label.replace(name, bare_name(name))} = {text}{f' ± {half}' if half else ''} {unit}".rstrip()
         for name, value in one.parameters.items()

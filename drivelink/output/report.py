@@ -110,7 +110,7 @@ def _effect(finding: Finding, unlisted: Curve | None) -> dict[str, Any]:
 
 
 def _points(curve: Curve) -> dict[str, list[float]]:
-    """The fitted curve, a few hundred points in order of the first coordinate."""
+    """Return the fitted curve, a few hundred points in order of the first coordinate."""
     order = np.argsort(curve.x)
     pick = order[np.unique(np.linspace(0, len(order) - 1, _CURVE_POINTS).astype(int))]
     points = {curve.coordinates[0]: curve.x[pick].tolist()}
@@ -258,7 +258,7 @@ def _curve_figure(curve: Curve, units: Units) -> Figure:
 
 
 def _is_function(curve: Curve) -> bool:
-    """Whether the fitted torque is nearly one function of the coordinate, in spite of the filter."""
+    """Return whether the fitted torque is nearly one function of the coordinate, in spite of the filter."""
     line = plots.medians(curve.x, curve.fitted_nm)
     left = curve.fitted_nm - np.interp(curve.x, line.x, line.y)
     return float(np.std(left)) < 0.35 * float(np.std(curve.fitted_nm)) + 1e-300

@@ -91,6 +91,6 @@ def others_of(finding: Finding) -> str:
 
 
 def _place(finding: Finding, outcome: Diagnosis) -> str:
-    """Its location, with the motor's number where there are two."""
+    """Return its location, with the motor's number where there are two."""
     several = len(outcome.transmissions) > 1 and finding.motor is not None
     return f"{finding.location} {(finding.motor or 0) + 1}" if several else finding.location

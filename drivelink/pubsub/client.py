@@ -77,7 +77,7 @@ class Subscription(Client):
         self.close()
 
     def close(self) -> None:
-        """Leave; a second time does nothing."""
+        """Close the session; a second time does nothing."""
         self._closed = True
         if hasattr(self, "_alarm"):
             self._wake()
@@ -201,7 +201,7 @@ class AsyncSubscription(Client):
         self.close()
 
     def close(self) -> None:
-        """Leave; a second time does nothing."""
+        """Close the session; a second time does nothing."""
         super().close()
         if hasattr(self, "_arrived"):
             self._arrived.set()

@@ -58,7 +58,7 @@ def joints(
 
 
 def ask(session: zenoh.Session, prefix: str, answer: Callable[[list[str]], None]) -> None:
-    """Have `answer` called in zenoh's thread with the names; never waits."""
+    """Call `answer` in zenoh's thread with the names; never waits."""
     names: set[str] = set()
     handler: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(
         lambda reply: _enter(names, reply, prefix), drop=lambda: answer(sorted(names)), indirect=False
@@ -267,7 +267,7 @@ class Client:
         return self._document("finding")
 
     def close(self) -> None:
-        """Leave; a second time does nothing."""
+        """Close the session; a second time does nothing."""
         self._closed = True
         with self._leaving:
             entities = [getattr(self, name, None) for name in ("_estimates", "_tokens")]
@@ -287,7 +287,7 @@ class Client:
         return document
 
     def _message(self, name: str) -> Any:
-        """The newest message of a key that the daemon wrote, or None."""
+        """Return the newest message of a key that the daemon wrote, or None."""
         self._drain()
         identity = self._feed.identity
         with suppress(zenoh.ZError):

@@ -171,12 +171,12 @@ class DaemonIdentity:
         return self._seen or self.bound is not None
 
     def heard(self, token: zenoh.Sample) -> None:
-        """Take a liveliness token that appeared or vanished."""
+        """Note that a liveliness token appeared or vanished."""
         session = str(token.key_expr).rpartition("/alive")[2].lstrip("/")
         self.token(session, token.kind == zenoh.SampleKind.PUT)
 
     def token(self, session: str, there: bool) -> None:
-        """A liveliness token appeared or vanished.
+        """Note that a liveliness token appeared or vanished.
 
         Args:
             session: what follows `alive/` in its key; "" for the joint's own token.

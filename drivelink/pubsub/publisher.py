@@ -159,7 +159,7 @@ class JointPublisher:
             raise ZenohError(taken)
 
     def _open_ros2(self, joint: JointFile) -> Ros2Publisher | None:
-        """The joint as a ROS 2 node, if declared."""
+        """Return the joint as a ROS 2 node, if declared."""
         if joint.ros2 is None or not joint.ros2.enabled:
             return None
         from drivelink.pubsub.ros2 import Ros2Publisher

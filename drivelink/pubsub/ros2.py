@@ -333,7 +333,7 @@ class Ros2Publisher:
                 self._entities.pop().undeclare()
 
     def _velocity(self, sequence: int, position: float, measured: float) -> float:
-        """The measured velocity, or the position differentiated through a first-order filter, rad/s."""
+        """Return the measured velocity, or the position behind a differentiating filter, rad/s."""
         before, self._before = self._before, (sequence, position)
         if measured == measured:  # not NaN
             self._velocity_rad_s = measured
@@ -346,7 +346,7 @@ class Ros2Publisher:
 
 
 def _touch(external: External | None) -> tuple[float, ...]:
-    """The values of the external torque's interfaces."""
+    """Return the values of the external torque's interfaces."""
     if external is None:
         return (math.nan, math.nan, 0.0, 0.0)
     valid, contact = (bool(external.status & bit) for bit in (ExternalStatus.VALID, ExternalStatus.CONTACT))
@@ -354,7 +354,7 @@ def _touch(external: External | None) -> tuple[float, ...]:
 
 
 def _mangle(name: str) -> str:
-    """A ROS name as one chunk of a zenoh key; an empty one is %."""
+    """Return a ROS name as one chunk of a zenoh key; an empty one is %."""
     return name.replace("/", "%") or "%"
 
 

@@ -51,7 +51,7 @@ class Stream:
         self.wanted = status.matching
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> None:
-        """Put a message; a full queue drops it unless the publisher waits."""
+        """Publish a message; a full queue drops it unless the publisher waits."""
         self._publisher.put(payload, attachment=attachment, source_info=self._source)
 
 
@@ -244,7 +244,7 @@ def _join(endpoint: str) -> zenoh.Session:
 
 
 def watch_router(session: zenoh.Session, tell: Callable[[bool], object]) -> Any:
-    """Have `tell` called in zenoh's thread when the connection to a router is lost (True), or there (False).
+    """Call `tell` in zenoh's thread when the connection to a router is lost (True), or there (False).
 
     Returns:
         The listener, to be undeclared.

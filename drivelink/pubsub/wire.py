@@ -193,7 +193,7 @@ def decode_estimate(payload: bytes) -> EstimateMessage:
 
 
 def _usable(message: EstimateMessage) -> bool:
-    """Whether all numbers are possible: finite, stiffness and standard deviation not negative."""
+    """Return whether all numbers are possible: finite, stiffness and standard deviation not negative."""
     _, _, status, torque, stiffness, std, transmissions = message
     partial = bool(status & _PARTIAL)
     if not (math.isfinite(torque) and _magnitude(stiffness, partial) and _magnitude(std, partial)):
@@ -210,7 +210,7 @@ def _usable(message: EstimateMessage) -> bool:
 
 
 def _magnitude(number: float, partial: bool) -> bool:
-    """Whether it is finite and not negative, or an allowed NaN."""
+    """Return whether it is finite and not negative, or an allowed NaN."""
     return 0.0 <= number < math.inf or (partial and number != number)
 
 

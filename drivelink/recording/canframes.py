@@ -179,7 +179,7 @@ class FrameLog:
             )
 
     def _period(self, syncs: list[int], configured_s: float) -> float:
-        """The period of the recorded SYNCs; the configured one if they agree."""
+        """Return the period of the recorded SYNCs; the configured one if they agree."""
         if len(syncs) < 3:
             raise RecordingError(
                 f"{self._path}: expected SYNC frames (0x080), which give the time of a sample, got "

@@ -153,7 +153,7 @@ def _channel(head: list[LoggedFrame], configured: str, path: Path) -> str | None
 
 
 def _same_channel(name: str, wanted: str) -> bool:
-    """Whether two names mean the same channel; some formats call can0 "0"."""
+    """Return whether two names mean the same channel; some formats call can0 "0"."""
     return name == wanted or (name.isdigit() and re.fullmatch(rf"\D*{name}", wanted) is not None)
 
 
@@ -198,7 +198,7 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
 
 
 def _either(line: bytes, parsers: list[_Parser]) -> LoggedFrame | None:
-    """The frame; a parser that understands it where the first does not becomes the first."""
+    """Return the frame; a parser that understands it where the first does not becomes the first."""
     if len(line) > _LINE:
         raise ValueError
     try:
@@ -233,7 +233,7 @@ def _spaced(line: bytes) -> LoggedFrame | None:
 def _frame(
     seconds: bytes | None, fraction: bytes, channel: bytes, can_id: bytes, data: bytes
 ) -> LoggedFrame | None:
-    """A frame of its texts; None: it is none of CANopen's."""
+    """Return a frame of its texts; None: it is none of CANopen's."""
     payload = bytes.fromhex(data.decode())
     if len(can_id) == _EXTENDED_DIGITS or int(can_id, 16) > _LAST_ID or len(payload) > _LONGEST:
         return None

@@ -253,7 +253,7 @@ def _on_grid(
 
 
 def _renumber(where: str, period_s: float) -> str:
-    """What makes uniform samples of a table whose stamps say nothing of them."""
+    """Return what makes uniform samples of a table whose stamps say nothing of them."""
     path = Path(where)
     if path.suffix.lower() != ".csv":
         return ""
@@ -293,7 +293,7 @@ def _channels(
 
 
 def _optional(columns: Mapping[str, FloatArray], name: str) -> FloatArray | None:
-    """A column, infinities as NaN; None if it has no finite value."""
+    """Return a column, infinities as NaN; None if it has no finite value."""
     values = columns.get(name)
     if values is None or not np.any(np.isfinite(values)):
         return None

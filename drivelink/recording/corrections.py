@@ -100,7 +100,7 @@ class Gathered:
 
 
 def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) -> Record | None:
-    """The complete samples as a recording; None if they are not one run."""
+    """Return the complete samples as a recording; None if they are not one run."""
     rows = [s for s in samples if np.all(np.isfinite((*s.motor_position_rad, *s.motor_torque_nm)))]
     linked = model.has_deflection
     rows = [s for s in rows if not linked or math.isfinite(s.link_position_rad)]
@@ -115,7 +115,7 @@ def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) ->
 
 
 def _text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -> str:
-    """The correction as text for the joint file."""
+    """Return the correction as text for the joint file."""
     changes = [change for finding in findings for change in finding.changes]
     found = corrections(joint, changes, live=live)
     scale = ", ".join(f"{c.key} = {c.value:.7g}" for c in found if c.table == "recording.scale")
@@ -165,7 +165,7 @@ def _new(table: str, key: str, value: float | int | None, factor: float) -> Corr
 
 
 def _column(joint: JointFile, change: Change, number: int = 0) -> Correction:
-    """A factor for a column, times the present one."""
+    """Return a factor for a column, times the present one."""
     names = {"time": "time_s", "link_position": "link_position_rad"}
     names |= {f"motor{number}_position": f"motor{number}_position_rad"}
     scale = joint.recording.scale
@@ -179,7 +179,7 @@ def _column(joint: JointFile, change: Change, number: int = 0) -> Correction:
 def _of_drive(
     drive: DriveSection, table: str, position: Change | None, torque: Change | None
 ) -> list[Correction]:
-    """The keys of a motor's drive: directions, counts, gear ratio, torque's scale."""
+    """Return the keys of a motor's drive: directions, counts, gear ratio, torque's scale."""
     a = position.factor if position else 1.0
     b = torque.factor if torque else 1.0
     found = []

@@ -86,7 +86,7 @@ class SyncNumbering:
         self._stamps: deque[int] = deque()  # of these SYNCs
 
     def push(self, frame: LoggedFrame) -> Sequence[Numbered]:
-        """Take a frame; return what is decided now."""
+        """Process a frame; return what is decided now."""
         cycles = self._cycles
         if frame.can_id == SYNC_COB_ID:
             cycles.append([frame])
@@ -102,7 +102,7 @@ class SyncNumbering:
         return [(self._cycles.popleft(), self._jump()) for _ in range(len(self._cycles))]
 
     def _jump(self) -> int:
-        """The jump of the first waiting SYNC."""
+        """Return the jump of the first waiting SYNC."""
         stamps = self._stamps
         if self._measure:
             self._measure = False
@@ -154,7 +154,7 @@ class Assembly:
         self._stamp_ns = self._before_ns = 0  # of the newest SYNC, and of the one before
 
     def cycles(self, frames: Iterable[LoggedFrame], jump: int) -> Iterator[Cycle]:
-        """Take numbered frames; yield the cycles that they end."""
+        """Process numbered frames; yield the cycles that they end."""
         assembler, feed = self.assembler, self.assembler.feed
         for stamp_ns, can_id, data, _ in frames:
             cycle, sample, is_sync = None, feed(can_id, data, jump), can_id == SYNC_COB_ID
@@ -202,7 +202,7 @@ class FrameSamples:
         return next((text for text in reasons if text), "")
 
     def feed(self, frame: LoggedFrame) -> list[tuple[Sample, int]]:
-        """Take a frame; return the samples that are certain now, and the stamps of their SYNCs."""
+        """Process a frame; return the samples that are certain now, and the stamps of their SYNCs."""
         return self._made(self._numbering.push(frame))
 
     def rest(self) -> list[tuple[Sample, int]]:
@@ -219,7 +219,7 @@ class FrameSamples:
         return found
 
     def _begun(self, can_id: int, data: bytes, now_s: float) -> Assembly | None:
-        """Take the mapping from a frame; None: that of some node is not known yet."""
+        """Return the mapping from a frame; None: that of some node is not known yet."""
         listener, passive = self._listener, not self._joint.bus.configure
         if self._lacking:
             return None

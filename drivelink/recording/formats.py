@@ -79,7 +79,7 @@ class _Layout(NamedTuple):
 
 
 def _opened(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[_Layout, Iterator[list[float]]]:
-    """The layout of a file, and its rows."""
+    """Return the layout of a file, and its rows."""
     header, line = _header(file, path)
     layout = _layout(header, path, names)
     return layout, _rows(file, layout, path, line)

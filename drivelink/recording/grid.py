@@ -160,7 +160,7 @@ def _number_jittered(time: FloatArray, where: str) -> tuple[NDArray[np.int64], f
 
 
 def _rounded(time: FloatArray, sequence: NDArray[np.int64], nominal_s: float | None) -> float:
-    """The period as slope of time over number, rounded if possible.
+    """Return the period as slope of time over number, rounded if possible.
 
     A round value is used if it is within three standard deviations of the slope.
     """

@@ -127,7 +127,7 @@ def contained(joint: JointFile) -> JointFile:
 
 
 def _carried(path: Path) -> bytes | None:
-    """The document with the joint file's text, if any."""
+    """Return the document with the joint file's text, if any."""
     suffix = path.suffix.lower()
     if suffix == ".mcap":
         message = next(read_messages(path, frozenset({"joint"})), None)

@@ -186,7 +186,7 @@ def _require_size(size: int, path: Path) -> None:
 
 
 def _decompressed(body: bytes, path: Path) -> bytes:
-    """The records of a chunk.
+    """Return the records of a chunk.
 
     Raises:
         RecordingError: too large, larger than declared, or of unknown compression.

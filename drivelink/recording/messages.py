@@ -71,7 +71,7 @@ def _band_columns(motors: int) -> tuple[str, ...]:
 
 
 def _band_row(message: EstimateMessage) -> tuple[float, ...]:
-    """The edges of the 95 % bands of the joint and of each transmission."""
+    """Return the edges of the 95 % bands of the joint and of each transmission."""
     stiffnesses = [(message.stiffness_nm_rad, message.stiffness_std_nm_rad)]
     stiffnesses += [(one.stiffness_nm_rad, one.stiffness_std_nm_rad) for one in message.transmissions]
     return tuple(x + side * SIGMA_95 * std for x, std in stiffnesses for side in (-1.0, 1.0))
@@ -143,7 +143,7 @@ def log_message(joint: str, time_s: float, text: str) -> bytes:
 
 @cache
 def _measured(motors: int) -> tuple[str, ...]:
-    """What a sample's message may hold, in order: positions, velocities, torques, then of the link."""
+    """Return what a sample's message may hold, in order: positions, velocities, torques, then of the link."""
     kinds = ("position_rad", "velocity_rad_s", "torque_nm")
     of_motors = (f"motor{i}_{kind}" for kind in kinds for i in range(1, motors + 1))
     return (*of_motors, "link_position_rad", "link_velocity_rad_s", "external_torque_nm")

@@ -37,7 +37,7 @@ def _columns(motors: int) -> tuple[str, ...]:
 
 
 def _row(played: Played, estimator: Estimator) -> tuple[float, ...]:
-    """A cycle, the last of the estimator, as the values of `_columns`."""
+    """Return a cycle, the last of the estimator, as the values of `_columns`."""
     estimate = played.tick.estimate
     totals = (estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad)
     row = estimate_row(played.time_s, estimate.status, totals, estimate.transmissions)

@@ -105,7 +105,7 @@ def _from_samples(samples: Iterable[Sample], times: list[float], pipeline: Joint
 def _after(
     state: bytes | None, cycles: Iterable[Cycle], pipeline: JointPipeline, path: Path
 ) -> Iterable[Cycle]:
-    """The cycles after a recorded state, which the pipeline takes; all of them where there is none.
+    """Return the cycles after a recorded state, which the pipeline takes; all of them where there is none.
 
     A state of another version of drivelink, or of another model than the pipeline's, is not used.
     """

@@ -50,7 +50,7 @@ class FirstSource:
         self._source: object = None
 
     def sample(self, source: object, sample: Sample, stamp_ns: int) -> None:
-        """Take a sample of a source."""
+        """Store a sample of a source."""
         if self._source is None:
             self._source = source
         if source is self._source:
@@ -100,7 +100,7 @@ class ZenohTap:
         return self._identity.refused + self._impossible
 
     def poll(self) -> None:
-        """Take everything that has come."""
+        """Store everything that has come."""
         now_s = time.monotonic()
         for subscriber, take in self._streams:
             while (sample := subscriber.try_recv()) is not None:
@@ -189,7 +189,7 @@ class BusTap:
         return self._samples.missing if self._samples is not None else ""
 
     def poll(self) -> None:
-        """Take everything that has come."""
+        """Store everything that has come."""
         if isinstance(self._source, LostSource):
             self._reopen()
         try:
@@ -219,7 +219,7 @@ class BusTap:
             self._bus.shutdown()
 
     def finish(self) -> None:
-        """Take the samples waiting for later SYNCs."""
+        """Store the samples waiting for later SYNCs."""
         if self._samples is not None:
             self._put_samples(self._samples.rest())
 

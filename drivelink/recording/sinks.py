@@ -154,25 +154,25 @@ class Sink:
         self.counts: dict[str, int] = dict.fromkeys(sorted(self.wants), 0)  # number of items of each kind
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
-        """Take what was measured at one SYNC."""
+        """Store what was measured at one SYNC."""
 
     def estimate(self, message: EstimateMessage) -> None:
-        """Take one estimate."""
+        """Store one estimate."""
 
     def external(self, message: ExternalMessage) -> None:
-        """Take one external torque."""
+        """Store one external torque."""
 
     def document(self, name: str, payload: bytes, stamp_ns: int) -> None:
-        """Take a JSON document: status, model."""
+        """Store a JSON document: status, model."""
 
     def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
-        """Take one CAN frame."""
+        """Store one CAN frame."""
 
     def snapshot(self, state: bytes) -> None:
-        """Take the state of the estimator after the newest samples, see `JointPipeline.snapshot`."""
+        """Store the state of the estimator after the newest samples, see `JointPipeline.snapshot`."""
 
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
-        """Take the mapping document, see `drivelink.recording.mapping`."""
+        """Store the mapping document, see `drivelink.recording.mapping`."""
 
     def flush(self) -> None:
         """Write everything to the disk."""
@@ -200,7 +200,7 @@ class CsvSink(Sink):
         self._file.write((",".join(columns) + "\n").encode())
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
-        """Take what was measured at one SYNC."""
+        """Store what was measured at one SYNC."""
         self.counts["sample"] += 1
         self._file.write((self._line % sample_row(sample, self._period_s)).encode())
 
@@ -222,22 +222,22 @@ class MessageSink(Sink):
         raise NotImplementedError
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
-        """Take what was measured at one SYNC."""
+        """Store what was measured at one SYNC."""
         self._put("sample", stamp_ns, self._encode_sample(sample))
         self.counts["sample"] += 1
 
     def estimate(self, message: EstimateMessage) -> None:
-        """Take one estimate."""
+        """Store one estimate."""
         self._put("estimate", message.stamp_ns, self._encode_estimate(message))
         self.counts["estimate"] += 1
 
     def external(self, message: ExternalMessage) -> None:
-        """Take one external torque."""
+        """Store one external torque."""
         self._put("external", message.stamp_ns, self._encode_external(message))
         self.counts["external"] += 1
 
     def document(self, name: str, payload: bytes, stamp_ns: int) -> None:
-        """Take a JSON document: status, model. The events of a status are log messages, too."""
+        """Store a JSON document: status, model. The events of a status are log messages, too."""
         self._put(name, stamp_ns, payload)
         self.counts["document"] += 1
         for time_s, text in events_of(payload) if name == "status" else ():
@@ -246,12 +246,12 @@ class MessageSink(Sink):
                 self._put("log", stamp_ns, log_message(self._name, time_s, text))
 
     def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
-        """Take one CAN frame."""
+        """Store one CAN frame."""
         self._put("can", stamp_ns, f'{{"id":{cob_id},"data":"{data.hex()}"}}'.encode())
         self.counts["frame"] += 1
 
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
-        """Take what makes samples of the frames."""
+        """Store what makes samples of the frames."""
         fields = {key: value for key, value in document.items() if key != "text"}
         self._put("mapping", stamp_ns, json.dumps(fields).encode())  # the joint file has a separate channel
 
@@ -326,7 +326,7 @@ class CanSink(Sink):
         self._channel: str | int = joint.bus.channel.replace(" ", "_") if suffix == ".log" else 0
 
     def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
-        """Take one CAN frame."""
+        """Store one CAN frame."""
         message = can.Message(
             timestamp=stamp_ns * 1e-9,
             arbitration_id=cob_id,
@@ -339,7 +339,7 @@ class CanSink(Sink):
         self.counts["frame"] += 1
 
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
-        """Take the content of the mapping file."""
+        """Store the content of the mapping file."""
         self._beside = json.dumps(document, indent=1) + "\n"
 
     def flush(self) -> None:

@@ -141,14 +141,14 @@ def _below_home(places: Iterable[Path]) -> list[Path]:
 
 
 def _plain(word: Path | str) -> str:
-    """A path or an option for a unit, where spaces and percent signs are special."""
+    """Return a path or an option for a unit, where spaces and percent signs are special."""
     if not _BARE.fullmatch(str(word)):
         raise UsageError(f"{word}: expected no spaces and special characters for a unit")
     return str(word)
 
 
 def _escape(channel: str) -> str:
-    """A name escaped for the name of a unit."""
+    """Return a name escaped for the name of a unit."""
     return channel.replace("-", "\\x2d")
 
 

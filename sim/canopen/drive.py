@@ -50,7 +50,7 @@ class StateMachine:
             self.state = PowerState.FAULT_REACTION
 
     def step(self) -> None:
-        """Take the automatic transitions of a cycle: end of the fault reaction and of a quick stop."""
+        """Perform the automatic transitions of a cycle: end of the fault reaction and of a quick stop."""
         if self.state is PowerState.FAULT_REACTION:
             self.state = PowerState.FAULT
         elif self.state is PowerState.QUICK_STOP_ACTIVE and self.quick_stop_option not in _QUICK_STOP_STAYS:
@@ -240,7 +240,7 @@ class Cia402Drive(Node):
             self._error_code.value = 0
 
     def fault(self, code: int, register: int = 0, vendor: bytes = b"") -> None:
-        """Let a fault occur in the drive: EMCY, fault reaction, fault.
+        """Raise a fault in the drive: EMCY, fault reaction, fault.
 
         Args:
             code: EMCY error code, e.g. 0x2310 (over-current).

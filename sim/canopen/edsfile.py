@@ -60,7 +60,7 @@ def with_head(sheet: str, file_name: str, name: str, product: int, order_code: s
 
 
 def _resize(eds: RawConfigParser, section: str, count: int) -> None:
-    """Give an array so many sensors, all zero."""
+    """Resize an array to so many sensors, all zero."""
     first = dict(eds[f"{section}sub1"])
     for place in eds.sections():
         if place.startswith(f"{section}sub") and int(place[7:], 16) > count:

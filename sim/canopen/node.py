@@ -78,7 +78,7 @@ class Node:
         return with_head(self.sheet, file_name, bytes(name).decode(), int(product), self.quirks.name)
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Put a frame on the bus."""
+        """Send a frame."""
         self._put(can_id, data)
 
     def _make_services(self) -> None:
@@ -253,7 +253,7 @@ class Node:
             tpdo.event()
 
     def process(self) -> None:
-        """Let time pass without a SYNC: sample, and send event-driven TPDOs."""
+        """Advance without a SYNC: sample, and send event-driven TPDOs."""
         self.on_sample()
         for tpdo in self._change_driven:
             tpdo.event()

@@ -68,7 +68,7 @@ class Pdo:
             slot.check = self._check_slot
 
     def compile(self) -> None:
-        """Take over changed parameters."""
+        """Apply changed parameters."""
         self._generation += 1
         self.valid = not self._cob.number & COB_INVALID
         self.can_id = self._cob.number & 0x7FF
@@ -98,7 +98,7 @@ class Pdo:
             self._begin(active, counting)
 
     def _begin(self, active: bool, counting: bool) -> None:
-        """Begin in another state, or with other parameters."""
+        """Start in another state, or with other parameters."""
         raise NotImplementedError
 
     def _check_cob(self, value: int) -> None:
@@ -160,7 +160,7 @@ class Pdo:
             raise SdoAbortedError(Abort.NOT_MAPPABLE)
 
     def _allows(self, entry: Entry | None) -> bool:
-        """Whether the entry (None: a dummy) may be in this kind of PDO."""
+        """Return whether the entry (None: a dummy) may be in this kind of PDO."""
         raise NotImplementedError
 
 

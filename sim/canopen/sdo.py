@@ -42,7 +42,7 @@ class SdoServer(CanopenServer):
         self._watch()
 
     def send_response(self, response: bytes) -> None:
-        """Put eight bytes on the bus."""
+        """Send eight bytes."""
         self._device.send(self.tx_cobid, bytes(response))
 
     def abort(self, abort_code: int = 0x08000000) -> None:

@@ -149,7 +149,7 @@ class HeartbeatConsumer:
         self._node.reroute()
 
     def receive(self, node_id: int) -> None:
-        """Take a heartbeat or boot-up message of a watched node."""
+        """Process a heartbeat or boot-up message of a watched node."""
         time_s = self.watched.get(node_id)
         if time_s is None:
             return

@@ -115,7 +115,7 @@ UNLISTED: dict[str, Definition] = {}
 def define(
     library: dict[str, Definition], location: str, name: str, meaning: str, **parameters: Described
 ) -> Callable[[Apply], Apply]:
-    """Put a function into a library as an effect; the arguments are those of `Definition`."""
+    """Register a function as an effect of a library; the arguments are those of `Definition`."""
     described = {key: (text,) if isinstance(text, str) else text for key, text in parameters.items()}
 
     def put(apply: Apply) -> Apply:

@@ -63,7 +63,7 @@ class Slip:
 
 
 def _element(exponent: float, shape: float) -> Element:
-    """The law in closed form where there is one."""
+    """Return the law in closed form where there is one."""
     if exponent >= 50.0:
         return lambda y, way: min(y + way, 1.0)
     if exponent == 1.0 and shape == 1.0:
@@ -156,7 +156,7 @@ class Lag:
         self._torque = 0.0
 
     def passed(self, torque: float) -> float:
-        """Mean output over the next step with this input."""
+        """Return the mean output over the next step with this input."""
         ahead = self._torque - torque
         self._torque = torque + ahead * self._keep
         return torque + ahead * self._mean

@@ -10,7 +10,7 @@ use crate::suspicion::{Reason, Signal};
 /// … or that slowed down: of the way of that time, a motor that friction brings to rest goes 1/16 in the last quarter, a
 /// reading that freezes in motion 1/4.
 const ABRUPT: f64 = 1.0 / 8.0;
-const ROUNDING: f64 = 1e-12; // of a position: what arithmetic may leave of counts that cancel
+const ROUNDING: f64 = 4e-9; // of a position: what arithmetic, or a text of ten digits, leaves of counts that cancel
 
 impl SampleValidator {
     /// Whether a channel is frozen: everything at rest is no fault, one encoder count now and then no motion.
@@ -107,4 +107,50 @@ fn stops_dead(trail: &VecDeque<[f64; PLACES]>, place: usize, count: f64) -> bool
     let way = |periods: usize| (trail[last][place] - trail[last - periods][place]).abs();
     let all = way(last);
     all > FAR * count && way(last / 4) - count > ABRUPT * all
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::SampleValidator;
+    use crate::model::{Arrangement, Model, Motor, Transmission};
+    use crate::sample::{MOTORS, Sample};
+
+    #[test]
+    fn digits_of_a_text_are_no_counts() {
+        let motor = Motor {
+            inertia: 0.1,
+            inertia_std: None,
+            damping: 0.2,
+            damping_std: None,
+            fit_rms: None,
+            transmission: Transmission::Unknown,
+            effects: Vec::new(),
+        };
+        let model = Model {
+            arrangement: Arrangement::Single,
+            motors: vec![motor],
+            link: None,
+            link_effects: Vec::new(),
+        };
+        let mut validator = SampleValidator::new(&model, 1e-3);
+        let count = std::f64::consts::TAU / 8000.0;
+        let read = |x: f64| format!("{:.9}", (x / count).round() * count).parse::<f64>().unwrap();
+        for k in 0..5000_u64 {
+            let t = 1e-3 * k as f64;
+            let q = read(1.5 + (2.0 * t).sin());
+            let sample = Sample {
+                sequence: k,
+                motor_position: [q; MOTORS],
+                motor_velocity: [f64::NAN; MOTORS],
+                motor_torque: [t.sin(); MOTORS],
+                link_position: q,
+                link_velocity: f64::NAN,
+                external_torque: f64::NAN,
+            };
+            validator.check(&sample);
+        }
+        for resolution in [validator.resolution()[0], validator.resolution()[1]] {
+            assert!((resolution - count).abs() < 1e-5 * count, "{resolution} of {count}");
+        }
+    }
 }

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import can
 import canopen
+from daemonkit import quiet_daemon
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "controller"
 if str(EXAMPLE) not in sys.path:
@@ -18,7 +19,6 @@ from controller import Controller, Cycle, Settings  # noqa: E402
 from drives import Master  # noqa: E402
 
 from drivelink import jointfile  # noqa: E402
-from drivelink.daemon.service import Daemon, ServedJoint  # noqa: E402
 from drivelink.demo.simbus import open_sim_bus  # noqa: E402
 from drivelink.demo.simulate import nodes_from_joint, world_from_joint  # noqa: E402
 from drivelink.pubsub.wire import decode_estimate, decode_external, decode_sample  # noqa: E402
@@ -73,9 +73,7 @@ class Rig:
         self.start_daemon()
 
     def start_daemon(self) -> None:
-        self.daemon = Daemon(
-            [ServedJoint(joint=self.joint)], publish=False, real_time=False, devices=self.network.poll
-        )
+        self.daemon = quiet_daemon(self.joint, devices=self.network.poll)
         self.daemon.loop.loop_joints[0].sink = self
 
     def kill_daemon(self) -> None:

@@ -156,6 +156,11 @@ def served(joint: JointFile) -> Iterator[Network]:
         bus.shutdown()
 
 
+def quiet_daemon(*joints: JointFile, **options: Any) -> Daemon:
+    """A daemon that publishes nothing and asks the system for nothing."""
+    return Daemon([ServedJoint(joint=joint) for joint in joints], publish=False, real_time=False, **options)
+
+
 def listens(joint: JointFile, devices: int) -> None:
     """Wait until one more than the simulated devices is on a virtual bus: from then on it misses no frame."""
     until(lambda: len(virtual.channels.get(joint.bus.channel, ())) > devices)

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from contextlib import suppress
 
 import can
+from daemonkit import quiet_daemon
 from faultstage import Stage
 
 import drivelink.daemon.buswatch
 from drivelink.canopen.bus import open_bus
-from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
@@ -31,9 +31,7 @@ class LockstepStage(Stage):
         self._patch = patch
         self._open = True
         patch(drivelink.daemon.buswatch, "open_bus", self._reopened)
-        self.daemon = Daemon(
-            [ServedJoint(joint=joint)], publish=False, real_time=False, devices=self.network.poll
-        )
+        self.daemon = quiet_daemon(joint, devices=self.network.poll)
         self._begin()
 
     def _reopened(self, section: BusSection) -> can.BusABC:
@@ -122,7 +120,7 @@ class RealStage(Stage):
         devices = self._serve if together else None
         if not together:
             self.network.start()
-        self.daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False, devices=devices)
+        self.daemon = quiet_daemon(joint, devices=devices)
         self._begin()
         self._thread = threading.Thread(target=self.daemon.run)
         self._thread.start()

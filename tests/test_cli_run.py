@@ -63,7 +63,7 @@ def test_run_ends_after_its_seconds_and_prints_two_objects_of_json(tmp_path, cap
     path = tmp_path / "elbow.toml"
     path.write_text(vsa_text(endpoint=free_endpoint(), bus="period_s = 0.02"), encoding="utf-8")
     with served(load(path)):
-        assert main(["run", str(path), "--no-realtime", "--seconds", "1", "--json"]) == 0
+        assert main(["run", str(path), "--no-realtime", "--seconds", "0.4", "--json"]) == 0
     ready, end = map(json.loads, capsys.readouterr().out.splitlines())  # and nothing else
     assert (ready["event"], ready["joints"], ready["rate_hz"]) == ("ready", ["elbow"], 50.0)
     (status,) = end["joints"]

@@ -10,31 +10,12 @@ from pathlib import Path
 
 import can
 import pytest
+from daemonkit import vsa_text
 from zenohkit import free_port, process, until
 
 from drivelink.cli import main
 
 PATIENCE_S = 60.0  # only ever waited for when something is broken
-
-JOINT = """
-name = "wrist"
-arrangement = "antagonistic"
-[[motor]]
-inertia_kg_m2 = 0.0005
-[motor.drive]
-node_id = 1
-[[motor]]
-inertia_kg_m2 = 0.0005
-[motor.drive]
-node_id = 2
-[link.encoder]
-[bus]
-interface = "socketcand"
-channel = "vcan0"
-options = {{ host = "127.0.0.1", port = {port} }}
-[sim]
-case = "vsa-ii"
-"""
 
 
 @pytest.fixture
@@ -45,7 +26,8 @@ def port() -> int:
 @pytest.fixture
 def file(tmp_path: Path, port: int) -> Path:
     path = tmp_path / "wrist.toml"
-    path.write_text(JOINT.format(port=port), encoding="utf-8")
+    bus = f'interface = "socketcand"\noptions = {{ host = "127.0.0.1", port = {port} }}'
+    path.write_text(vsa_text(name="wrist", channel="vcan0", bus=bus), encoding="utf-8")
     return path
 
 
@@ -62,8 +44,10 @@ def test_simulations_and_masters_share_the_bus_over_tcp_and_sigterm_ends_the_fir
     path = tmp_path / "elbow.toml"
     path.write_text(file.read_text().replace("wrist", "elbow").replace("node_id = ", "node_id = 1"))
     with simulation(file) as (drives, ready), simulation(path) as (joined, second):
-        assert "elbow (drive 11, drive 12)" in second
-        assert ready == ("drivelink sim: ready on socketcand vcan0: wrist (drive 1, drive 2); Ctrl-C ends it")
+        assert "elbow (drive 11, drive 12, encoder 13)" in second
+        assert ready.startswith(
+            "drivelink sim: ready on socketcand vcan0: wrist (drive 1, drive 2, encoder 3); Ctrl-C"
+        )
         with can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=port) as bus:
             bus.send(can.Message(arbitration_id=0, data=[1, 0], is_extended_id=False))
             seen: set[int] = set()
@@ -78,7 +62,7 @@ def test_simulations_and_masters_share_the_bus_over_tcp_and_sigterm_ends_the_fir
         assert main(["sim", str(file), "--seconds", "1"]) == 4  # the same nodes a second time
         said = capsys.readouterr().err.splitlines()
         assert "joined" in said[0]
-        assert "node 1, node 2: on the bus already: another `drivelink sim`" in said[1]
+        assert "node 1, node 2, node 3: on the bus already: another `drivelink sim`" in said[1]
         drives.send_signal(signal.SIGTERM)
         assert drives.wait(PATIENCE_S) == 0 and drives.stderr.read() == ""
         assert joined.wait(PATIENCE_S) == 4

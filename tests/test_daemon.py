@@ -12,7 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from daemonkit import Collector, DaemonRig, Listener, rig, running, served, vsa, vsa_text
+from daemonkit import Collector, DaemonRig, Listener, quiet_daemon, rig, running, served, vsa, vsa_text
 from zenohkit import free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
@@ -27,8 +27,8 @@ from drivelink.loop import acceptance
 from estimator.sample import Estimate, Status
 
 
-def daemon(joint: JointFile, **options: bool) -> Daemon:
-    return Daemon([ServedJoint(joint=joint)], real_time=False, **options)
+def daemon(joint: JointFile) -> Daemon:
+    return Daemon([ServedJoint(joint=joint)], real_time=False)
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def test_when_sync_stops_the_estimates_are_stale_and_come_back_with_it():
 
         maker = threading.Thread(target=master)
         maker.start()
-        follower = daemon(follow, publish=False)
+        follower = quiet_daemon(follow)
         pipeline = follower.pipelines[0]
         with running(follower):
             until(lambda: pipeline.estimate and not pipeline.estimate.status & Status.STALE)
@@ -314,13 +314,12 @@ def two_joints() -> Iterator[Daemon]:
     with ExitStack() as stack:
         buses = [stack.enter_context(open_sim_bus(elbow.bus)) for _ in joints]
         networks = [network_from_joint(joint, bus) for joint, bus in zip(joints, buses, strict=True)]
-        serving = [ServedJoint(joint=joint) for joint in joints]
 
         def devices() -> None:
             for network in networks:
                 network.poll()
 
-        yield stack.enter_context(Daemon(serving, publish=False, real_time=False, devices=devices))
+        yield stack.enter_context(quiet_daemon(*joints, devices=devices))
 
 
 class Broken:

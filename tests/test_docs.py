@@ -7,6 +7,7 @@ import ast
 import dataclasses
 import importlib
 import importlib.util
+import json
 import re
 import shlex
 import tomllib
@@ -38,8 +39,9 @@ DOCUMENTS = [
 OWN = {"drivelink", "estimator", "sim"}
 
 
-def generator() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
+def program(name: str) -> ModuleType:
+    """A program of the documentation, as a module."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -52,7 +54,7 @@ def subparsers() -> dict[str, argparse.ArgumentParser]:
 
 
 def test_tables_in_pages_are_those_of_the_code_and_each_is_asked_for():
-    made, texts = generator(), {page: page.read_text(encoding="utf-8") for page in PAGES}
+    made, texts = program("generate"), {page: page.read_text(encoding="utf-8") for page in PAGES}
     asked = [name for text in texts.values() for name in made.ASKED.findall(text)]
     asked += [name for text in texts.values() for _, name, _ in made.MARKED.findall(text)]
     assert sorted(asked) == sorted(made.PARTS)
@@ -61,7 +63,7 @@ def test_tables_in_pages_are_those_of_the_code_and_each_is_asked_for():
 
 
 def test_no_cell_of_a_table_from_the_code_is_unexplained_and_every_key_of_a_joint_file_is_in_one():
-    parts = {name: part() for name, part in generator().PARTS.items()}
+    parts = {name: part() for name, part in program("generate").PARTS.items()}
     for name, text in parts.items():
         rows = re.findall(r"^\| .* \|$", text, re.MULTILINE)
         assert all(row.count(" | ") == rows[0].count(" | ") for row in rows), name
@@ -186,3 +188,22 @@ def test_the_script_of_pictures_asks_of_the_browser_what_it_can():
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "browser"
     }
     assert asked and asked <= set(dir(Chromium))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_notebook_finds_the_effect_and_its_outputs_are_stored(tmp_path):
+    made = program("notebook")
+    stored = json.loads(made.NOTEBOOK.read_text(encoding="utf-8"))
+    executed, names = made.execute(made.NOTEBOOK, tmp_path)
+    (effect,) = names["outcome"].effects
+    assert (effect.name, effect.motor) == ("coulomb_friction", 0)
+    assert effect.parameters["torque_nm"] == pytest.approx(0.004, rel=0.05)  # as it was switched on
+    errors = names["outcome"].validation
+    assert errors.after_rms_nm < 0.2 * errors.before_rms_nm
+    files = (jointfile.load(names[name]) for name in ("elbow", "better"))
+    fitted, better = ([one.name for one in file.motor[0].effect] for file in files)
+    assert better == [*fitted, "coulomb_friction"]  # to what the fit wrote, the diagnosis adds one effect
+    for cell, fresh in zip(stored["cells"], executed["cells"], strict=True):
+        shown = [[sorted(out.get("data", ())) for out in one.get("outputs", ())] for one in (cell, fresh)]
+        assert shown[0] == shown[1], "run python docs/notebook.py"

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import can
 import pytest
-from daemonkit import running, served, vsa
+from daemonkit import quiet_daemon, running, served, vsa
 from zenohkit import free_port, until
 
 from drivelink._core import JointPipeline
 from drivelink.canopen.bus import open_bus
 from drivelink.cycle.sources import BusLostError, open_source
-from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.daemon.service import Daemon
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.recording.formats import open_sink
@@ -109,7 +109,7 @@ def test_a_joint_behind_a_serial_adapter_that_is_pulled_out_and_put_in(tmp_path)
     adapter = SerialAdapter(tmp_path / "ttyCAN", behind.bus.channel)
     try:
         with served(behind):
-            daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
+            daemon = quiet_daemon(joint)
             pipeline = daemon.pipelines[0]
             with running(daemon):
                 until(lambda: is_fresh(pipeline))
@@ -149,7 +149,7 @@ def test_a_socketcand_server_that_goes_and_comes_back_and_a_second_daemon_that_i
             source.wait(0.01)
             tap = BusTap(open_bus(joint.bus), joint, sink, None)
             stack.callback(tap.close)
-            daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
+            daemon = quiet_daemon(joint)
             pipeline = daemon.pipelines[0]
             stack.enter_context(running(daemon))
             until(lambda: is_fresh(pipeline))
@@ -157,7 +157,7 @@ def test_a_socketcand_server_that_goes_and_comes_back_and_a_second_daemon_that_i
             reboots = [c.reboots for c in pipeline.assembler.counters.values()]
             with pytest.raises(BusError, match="another master already produces SYNC"):
                 other = joint.model_copy(update={"name": "other"})
-                Daemon([ServedJoint(joint=other)], publish=False, real_time=False)
+                quiet_daemon(other)
             assert [c.reboots for c in pipeline.assembler.counters.values()] == reboots
             assert not any("configured again" in e["text"] for e in daemon.events.recent())
         until(lambda: lost(daemon))

@@ -242,7 +242,7 @@ def test_in_a_terminal_question_mark_shows_the_legend_and_q_quits(daemon):
 def test_a_joint_that_nobody_serves_is_not_live_and_the_nearest_is_named(daemon, capsys, monkeypatch):
     monkeypatch.setattr("drivelink.monitor.watcher.PATIENCE_S", 0.3)
     assert (
-        cli.main(["monitor", "elbwo", "--endpoint", daemon, "--every", "0.3", "--seconds", "1.6", "--json"])
+        cli.main(["monitor", "elbwo", "--endpoint", daemon, "--every", "0.2", "--seconds", "1", "--json"])
         == 6
     )
     displayed = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -258,7 +258,7 @@ def test_a_live_view_needs_a_terminal_with_its_characters():
 
 
 def test_plain_lines_repeat_nothing_and_end_where_nobody_serves_the_joint(daemon, capsys, monkeypatch):
-    monkeypatch.setattr("drivelink.cli.monitor._ABSENT_S", 1.0)
+    monkeypatch.setattr("drivelink.cli.monitor._ABSENT_S", 0.5)
     assert cli.main(["monitor", "elbwo", "--endpoint", daemon, "--every", "0.1"]) == 6
     said = capsys.readouterr()
     lines = [line.split(" ", 1)[1] for line in said.out.splitlines()]

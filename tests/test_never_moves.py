@@ -8,11 +8,11 @@ import time
 
 import pytest
 from can.interfaces.virtual import VirtualBus
-from daemonkit import Listener, listens, rig, running, served, vsa, vsa_text
+from daemonkit import Listener, listens, quiet_daemon, rig, running, served, vsa, vsa_text
 from zenohkit import until
 
 from drivelink.cycle.sources import VirtualSource
-from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.daemon.service import Daemon
 from drivelink.jointfile import parse
 
 NODES = (1, 2, 3)
@@ -128,7 +128,3 @@ def test_a_passive_daemon_puts_no_frame_on_the_bus_whatever_happens(monkeypatch)
     mine = [cob_id for sender, cob_id in senders if sender is follower._port.bus]
     assert mine == []
     assert len({id(sender) for sender, _ in senders}) == 2  # the devices and the master
-
-
-def quiet_daemon(joint):
-    return Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)

@@ -6,23 +6,12 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from canopenkit import joint_text
 
 from drivelink import cli
 from drivelink.jointfile import parse
 from drivelink.systemd.unit import installation
 
-JOINT = """\
-name = "elbow"
-[[motor]]
-inertia_kg_m2 = 0.125
-[motor.transmission]
-model = "linear"
-parameters = {{ k_nm_rad = 700.0 }}
-[bus]
-interface = "{interface}"
-channel = "{channel}"
-bitrate = 500000
-"""
 UNIT = Path("etc/systemd/system/drivelink@elbow.service")
 NETWORK = Path("etc/systemd/network/80-drivelink-can0.network")
 
@@ -32,9 +21,13 @@ def joint(tmp_path):
     return written(tmp_path)
 
 
+def text(interface, channel):
+    return joint_text(bus=f'interface = "{interface}"\nchannel = "{channel}"\nbitrate = 500000')
+
+
 def written(folder, interface="socketcan", channel="can0"):
     path = folder / "elbow.toml"
-    path.write_text(JOINT.format(interface=interface, channel=channel), encoding="utf-8")
+    path.write_text(text(interface, channel), encoding="utf-8")
     return path
 
 
@@ -95,10 +88,11 @@ def test_a_home_installation_is_let_in_and_keys_come_as_credentials(monkeypatch)
     """The unit sees nothing below /home but these, and they read-only."""
     monkeypatch.setattr("sys.prefix", "/home/eva/venv")
     monkeypatch.setattr("sys.base_prefix", "/home/eva/.pyenv/versions/3.12")
-    text = JOINT.format(interface="slcan", channel="/dev/ttyACM0")
     path = Path("/home/eva/robots/elbow.toml")
     more = {"allow": ["10.0.0.0/24"], "credentials": ["daemon.key=/etc/ssl/private/daemon.key"]}
-    made = installation(parse(text), path, Path("/home/eva/venv/bin/drivelink"), **more)
+    made = installation(
+        parse(text("slcan", "/dev/ttyACM0")), path, Path("/home/eva/venv/bin/drivelink"), **more
+    )
     (unit,) = made.files.values()
     bound = re.findall(r"^BindReadOnlyPaths=(.*)$", unit, re.MULTILINE)
     assert {"/home/eva/venv", "/home/eva/.pyenv/versions/3.12", "/home/eva/robots"} <= set(bound)

@@ -98,13 +98,6 @@ def test_integration_converges_with_order_four(motors):
         assert 13.0 < coarse / fine < 20.0  # 2^4, with the next order's remainder
 
 
-def test_both_motors_of_a_vsa_pull_at_the_link():
-    state = [0.0, 0.0, 0.01, 0.0, -0.02, 0.0]
-    integrator(sea(LINEAR, motors=2, damping=0.0, gravity=0.0), 1e-4)(state, 0.0, 0.0, 0.0)
-    # tau_e,1 = -1.5 and tau_e,2 = 3 N·m: the link gets -(1.5), the motors -1.5 and +3 (eqs 6, 7, 9).
-    assert state[1::2] == pytest.approx([-1.5e-4 / 0.4, -1.5e-4 / 0.125, 3e-4 / 0.125], rel=1e-3)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [

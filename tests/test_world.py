@@ -48,7 +48,7 @@ def played(record: Record, motor: Motor):
     return estimator, stiffness, std, valid > 0
 
 
-EXACT = "motor_counts=0 link_bits=0 seconds=3"
+EXACT = "motor_counts=0 link_bits=0 seconds=2"
 
 
 @pytest.mark.parametrize(

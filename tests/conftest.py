@@ -1,5 +1,6 @@
 """What holds for every test, and how they are shared out where several processes run them (`-n 2`)."""
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -47,6 +48,10 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    # A tenth of the time would go into looking through hundreds of modules for garbage, again and again.
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000)
     for item in items:
         if item.path.stem in REAL_TIME:
             item.add_marker(pytest.mark.real_time)

@@ -101,6 +101,7 @@ NUMERIC = {
     "paper.rs SIGMA_95": "quantile of the normal distribution",
     "sample_validator/channels.rs ABRUPT": "between 1/16 of a parabola and 1/4 of a line",
     "sample_validator/channels.rs ROUNDING": "what arithmetic, or a text of ten digits, leaves of counts that cancel",
+    "sample_validator/channels.rs SINGLE": "what single precision leaves of them",
     "spring.rs RIDGE": "keeps rounding from deciding between parallel functions",
     "unknowns.rs NARROWEST": "end of a grid of shapes that is refined afterwards",
     "unknowns.rs WIDEST": "the other end",

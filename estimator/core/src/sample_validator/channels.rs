@@ -10,7 +10,9 @@ use crate::suspicion::{Reason, Signal};
 /// … or that slowed down: of the way of that time, a motor that friction brings to rest goes 1/16 in the last quarter, a
 /// reading that freezes in motion 1/4.
 const ABRUPT: f64 = 1.0 / 8.0;
-const ROUNDING: f64 = 4e-9; // of a position: what arithmetic, or a text of ten digits, leaves of counts that cancel
+/// Of a position: what arithmetic, or a text of ten digits, leaves of counts that cancel …
+const ROUNDING: f64 = 4e-9;
+const SINGLE: f64 = 2.5e-7; // … and of one in single precision
 
 impl SampleValidator {
     /// Whether a channel is frozen: everything at rest is no fault, one encoder count now and then no motion.
@@ -82,8 +84,10 @@ impl SampleValidator {
             let size = change.abs();
             // Of a joint that turns steadily no change is small; a change of the change is whole counts as well.
             let second = if m.seen > 0 && periods == m.span { bend * periods } else { 0.0 };
+            let place = places[i];
+            let rounding = if f64::from(place as f32) == place { SINGLE } else { ROUNDING };
             for count in [size, second] {
-                if count > ROUNDING * places[i].abs() && count < m.steps[i] {
+                if count > rounding * place.abs() && count < m.steps[i] {
                     m.steps[i] = count;
                 }
             }
@@ -116,7 +120,7 @@ mod tests {
     use crate::sample::{MOTORS, Sample};
 
     #[test]
-    fn digits_of_a_text_are_no_counts() {
+    fn digits_of_a_text_and_single_precision_are_no_counts() {
         let motor = Motor {
             inertia: 0.1,
             inertia_std: None,
@@ -132,25 +136,28 @@ mod tests {
             link: None,
             link_effects: Vec::new(),
         };
-        let mut validator = SampleValidator::new(&model, 1e-3);
         let count = std::f64::consts::TAU / 8000.0;
-        let read = |x: f64| format!("{:.9}", (x / count).round() * count).parse::<f64>().unwrap();
-        for k in 0..5000_u64 {
-            let t = 1e-3 * k as f64;
-            let q = read(1.5 + (2.0 * t).sin());
-            let sample = Sample {
-                sequence: k,
-                motor_position: [q; MOTORS],
-                motor_velocity: [f64::NAN; MOTORS],
-                motor_torque: [t.sin(); MOTORS],
-                link_position: q,
-                link_velocity: f64::NAN,
-                external_torque: f64::NAN,
-            };
-            validator.check(&sample);
-        }
-        for resolution in [validator.resolution()[0], validator.resolution()[1]] {
-            assert!((resolution - count).abs() < 1e-5 * count, "{resolution} of {count}");
+        let text = |x: f64| format!("{x:.9}").parse::<f64>().unwrap();
+        let single = |x: f64| f64::from(x as f32);
+        for written in [text as fn(f64) -> f64, single] {
+            let mut validator = SampleValidator::new(&model, 1e-3);
+            for k in 0..5000_u64 {
+                let t = 1e-3 * k as f64;
+                let q = written(((1.5 + (2.0 * t).sin()) / count).round() * count);
+                let sample = Sample {
+                    sequence: k,
+                    motor_position: [q; MOTORS],
+                    motor_velocity: [f64::NAN; MOTORS],
+                    motor_torque: [t.sin(); MOTORS],
+                    link_position: q,
+                    link_velocity: f64::NAN,
+                    external_torque: f64::NAN,
+                };
+                validator.check(&sample);
+            }
+            for resolution in [validator.resolution()[0], validator.resolution()[1]] {
+                assert!((resolution - count).abs() < 1e-3 * count, "{resolution} of {count}");
+            }
         }
     }
 }

@@ -17,7 +17,7 @@ pub const COLUMNS: usize = 32;
 pub type Row = [f64; COLUMNS];
 
 /// Unknowns of a balance, with index 0 for what they explain.
-pub const UNKNOWNS: usize = 24;
+pub const UNKNOWNS: usize = 26;
 
 /// One value an unknown.
 pub type Vector = [f64; UNKNOWNS];
@@ -279,23 +279,25 @@ pub fn solve(reduced: &Matrix, set: Set, prior: &Prior, noise: f64) -> Option<Po
 /// The groups of unknowns that the evidence adds to a base, one after the other.
 ///
 /// A group is added if it raises the evidence by more than the number of groups: the odds against each before
-/// any data.
+/// any data. Of two that explain the same, one of the `usual` unknowns is as much likelier.
 #[must_use]
-pub fn choose(reduced: &Matrix, base: Set, groups: &[Set], prior: &Prior, noise: f64) -> Set {
+pub fn choose(reduced: &Matrix, base: Set, groups: &[Set], usual: Set, prior: &Prior, noise: f64) -> Set {
     let threshold = (groups.iter().filter(|group| **group != 0).count().max(1) as f64).ln();
     let (mut set, mut best) = (base, log_evidence(reduced, base, prior, noise));
     loop {
-        let mut next = (set, best + threshold);
+        let mut next = (set, best, 0.0);
         for group in groups.iter().filter(|group| *group & !set != 0) {
             let tried = log_evidence(reduced, set | group, prior, noise);
-            if tried > next.1 {
-                next = (set | group, tried);
+            let odds = tried - best - threshold;
+            let odds = if odds > 0.0 && group & !set & !usual == 0 { odds + threshold } else { odds };
+            if odds > next.2 {
+                next = (set | group, tried, odds);
             }
         }
         if next.0 == set {
             return set;
         }
-        (set, best) = next;
+        (set, best) = (next.0, next.1);
     }
 }
 

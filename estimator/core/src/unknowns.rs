@@ -40,6 +40,8 @@ pub const STOPS: std::ops::Range<usize> = 16..19;
 pub const CLIPS: std::ops::Range<usize> = 19..23;
 /// A corner of the stiffness at zero, N·m at the largest deflection.
 pub const CORNER: std::ops::Range<usize> = 23..24;
+/// A spring that is stiffer to one side: of |φ|, N·m/rad, and of φ², N·m/rad².
+pub const ASYMMETRY: std::ops::Range<usize> = 24..26;
 
 /// Those that every joint has.
 pub const ACTIVE: Set = (1 << SOFT) - 2;
@@ -58,12 +60,13 @@ pub struct Candidate {
 }
 
 /// The groups of unknowns that evidence chooses.
-pub const CANDIDATES: [Candidate; 5] = [
+pub const CANDIDATES: [Candidate; 6] = [
     Candidate { unknowns: SOFT..SOFT + 1, name: "stribeck_friction" },
     Candidate { unknowns: LOAD, name: "load_dependent_friction" },
     Candidate { unknowns: RATE..RATE + 1, name: "transmission_damping" },
     Candidate { unknowns: STOPS, name: "hysteresis" },
     Candidate { unknowns: CLIPS, name: "backlash" },
+    Candidate { unknowns: ASYMMETRY, name: "asymmetric_stiffness" },
 ];
 
 /// What the priors of zero, shape and delay are measured by.
@@ -119,8 +122,7 @@ impl Spring {
             law.shapes().iter().zip(&mut alpha[1..]).for_each(|(shape, value)| *value = shape.start);
         }
         let (least, size) = match law {
-            Law::Linear => (1, 1),
-            Law::Polynomial => (order.unwrap_or(1).max(n).min(TERMS), TERMS),
+            Law::Linear | Law::Polynomial => (order.unwrap_or(1).max(n).min(TERMS), TERMS),
             _ => (1 + law.shapes().len(), 1 + law.shapes().len()),
         };
         let covariance = written.filter(|_| n == least && n == given.len()).map(|rows| {
@@ -197,7 +199,7 @@ impl Spring {
     /// Whether its stiffness is one number: its zero is then a constant torque.
     #[must_use]
     pub fn is_constant(&self) -> bool {
-        self.size == 1 && self.law.is_polynomial()
+        self.law.is_polynomial() && self.alpha[1..].iter().all(|power| *power == 0.0)
     }
 
     /// Whether one solution is final: the balance is linear in its parameters, and its zero is where it was.
@@ -304,6 +306,10 @@ impl Spring {
         if !self.is_linear() {
             place(&mut frame.left, &self.torque(projection), -1.0);
         }
+        for (k, unknown) in ASYMMETRY.enumerate() {
+            let even = projection.of(|phi| self.uneven(phi)[k].0);
+            place(&mut frame.directions[unknown], &even, 1.0);
+        }
         let slope = self.slope(projection);
         let moved = projection.of(|phi| self.law.at(phi + self.zero, alpha).1);
         place(&mut frame.directions[ZERO], &moved, 1.0);
@@ -324,6 +330,12 @@ impl Spring {
     fn curve(&self, phi: f64) -> (f64, f64) {
         let (torque, stiffness) = self.law.at(phi + self.zero, self.parameters());
         (torque + self.corner * phi * phi.abs(), stiffness + 2.0 * self.corner * phi.abs())
+    }
+
+    /// |φ| and φ² from the zero on, and their slopes.
+    fn uneven(&self, phi: f64) -> [(f64, f64); 2] {
+        let phi = phi + self.zero;
+        [(phi.abs(), phi.signum()), (phi * phi, 2.0 * phi)]
     }
 
     /// τ_e as a sum of the family's functions.

@@ -280,13 +280,13 @@ impl Blocks {
         if !many {
             groups[..CANDIDATES.len()].fill(0); // few rows show noise as effects
         }
-        let found = choose(reduced, base, &groups, prior, noise);
+        let found = choose(reduced, base, &groups, self.spring.shape(), prior, noise);
         if many && !self.lost && frame.set >> ZERO & 1 == 1 {
             // The zero is where it is declared, or anywhere in the range.
             let log = log_evidence(reduced, found, prior, noise);
             let elsewhere = self.prior(total, frame, self.deflection);
             groups[ALONE - 1..].fill(0); // a corner is at the declared zero
-            let other = choose(reduced, base, &groups, &elsewhere, noise);
+            let other = choose(reduced, base, &groups, self.spring.shape(), &elsewhere, noise);
             if log_evidence(reduced, other, &elsewhere, noise) > log + (groups.len() as f64).ln() {
                 let found = solve(reduced, other, &elsewhere, noise)?;
                 if self.is_seen(self.spring.zero + found.x[ZERO]) {
@@ -301,7 +301,7 @@ impl Blocks {
     /// deflections reach as far beyond it to either side.
     fn is_seen(&self, moved: f64) -> bool {
         let ([low, high], spring) = (self.seen, &self.spring);
-        let open = spring.law.is_polynomial() && !spring.is_constant() && !spring.is_anchored();
+        let open = spring.law.is_polynomial() && !spring.is_anchored();
         !open || 2.0 * moved.abs() < high.min(-low)
     }
 }

@@ -105,7 +105,22 @@ fn a_prior_is_data_that_came_before() {
 fn evidence_takes_the_unknown_that_acts_and_leaves_the_one_that_does_not() {
     let prior = Prior::independent([0.0; UNKNOWNS], &[1.0; UNKNOWNS]);
     let reduced = plain(0b1110).reduce(&sum(&rows(400, [2.0, -0.03], 7, 0.1)));
-    assert_eq!(choose(&reduced, 0b10, &[0b100, 0b1000], &prior, 1.0 / 300.0), 0b110);
+    assert_eq!(choose(&reduced, 0b10, &[0b100, 0b1000], 0, &prior, 1.0 / 300.0), 0b110);
+}
+
+#[test]
+fn of_two_that_explain_the_same_evidence_takes_the_usual_one() {
+    let prior = Prior::independent([0.0; UNKNOWNS], &[1.0; UNKNOWNS]);
+    let same: Vec<Row> = (rows(400, [2.0, -0.03], 7, 0.1).into_iter())
+        .map(|mut row| {
+            row[3] = 1.01 * row[2];
+            row
+        })
+        .collect();
+    let reduced = plain(0b1110).reduce(&sum(&same));
+    for usual in [0b100, 0b1000] {
+        assert_eq!(choose(&reduced, 0b10, &[0b100, 0b1000], usual, &prior, 1.0 / 300.0), 0b10 | usual);
+    }
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Torque and stiffness that the unknowns make at a deflection.
 
-use super::{CLIPS, CORNER, LATE, SPRING, STOPS, Spring, ZERO};
+use super::{ASYMMETRY, CLIPS, CORNER, LATE, SPRING, STOPS, Spring, ZERO};
 use crate::balance;
 use crate::balance::Balance;
 use crate::gram::{Set, UNKNOWNS, Vector};
@@ -43,6 +43,11 @@ impl Spring {
             let square = balance.size.deflection.powi(2);
             by_torque[CORNER.start] = now * now.abs() / square;
             by_stiffness[CORNER.start] = 2.0 * now.abs() / square;
+        }
+        for (unknown, (more, stiffer)) in ASYMMETRY.zip(self.uneven(now)) {
+            (by_torque[unknown], by_stiffness[unknown]) = (more, stiffer);
+            torque += x[unknown] * more;
+            stiffness += x[unknown] * stiffer;
         }
         (by_torque[ZERO], by_stiffness[ZERO]) = (stiffness, bend);
         (by_torque[LATE], by_stiffness[LATE]) = (stiffness * link_rate, bend * link_rate);

@@ -156,8 +156,7 @@ def _model(effects, order=1):
 
 def test_stiffness_and_torque_on_line_are_those_of_model_and_elastic_effects_together(rig):
     truth, record = rig
-    estimator = make_estimator(_model(HIGHER), EstimatorSettings(), T)
-    out = np.array([estimator.step(sample)[:5] for sample in record.samples()])[4000:]
+    out = joints.estimates(_model(HIGHER), record)[4000:]
     sigma, tau = truth.sigma[4000:, 0, 0], truth.tau_e[4000:, 0, 0]
     assert np.ptp(sigma) > 0.1 * np.mean(sigma)  # the effects matter
     usable = out[:, 1].astype(int) & 3 == 3

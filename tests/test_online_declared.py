@@ -1,8 +1,7 @@
 """What a joint file declares of its springs is where the estimate begins, and never where it is held.
 
 "Within its interval" is three standard deviations, or what nobody can notice: 0.2 % of the stiffness, as seconds in
-which an error hardly changes are one draw. For the VSA-II it is 0.5 %: where the motion hardly reveals its shape (here
-|phi| < 0.07 rad of 1.26), k and c run along the line on which they make up for each other. That falls short.
+which an error hardly changes are one draw.
 """
 
 from functools import lru_cache
@@ -43,7 +42,6 @@ SPRINGS = {
     ),
 }
 ORDERS = {"linear": (None, 1), "polynomial": (None, 2)}
-NOTICED = {"vsa-ii": 5e-3}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -74,7 +72,7 @@ def ends(model, order, parameters, noisy):
     joint = joints.joint_model(B, D, model=model, order=order, parameters=parameters)
     out = joints.estimates(joint, joints.record(truth, 0, T, **how))[LAST]
     valid, sigma = out[:, 1].astype(int) & 1 > 0, truth.sigma[LAST, 0, 0]
-    allowed = np.maximum(3.0 * out[:, 4], NOTICED.get(model, 2e-3) * sigma)
+    allowed = np.maximum(3.0 * out[:, 4], 2e-3 * sigma)
     assert np.mean(valid) > 0.99
     assert np.all((np.abs(out[:, 3] - sigma) <= allowed)[valid])
 

@@ -1,10 +1,11 @@
-"""Friction that nobody declared, where a controller makes the torque, and springs that bend: right, or in the interval."""
+"""What nobody declared: a held motor's friction, springs that bend, a shape that the motion does not show."""
 
 import heldmotor
 import numpy as np
 import onlinekit as kit
 import pytest
 
+from sim.cases import case
 from sim.effects import make
 
 
@@ -32,3 +33,13 @@ def test_a_spring_that_is_declared_linear_and_bends_is_named_and_right(name, par
     assert name in estimator.undeclared()[0]
     assert np.mean(estimates.valid[-6000:]) > 0.99
     assert np.mean(off[estimates.valid[-6000:]] < 0.05) > 0.99
+
+
+def test_a_vsa_whose_shape_small_deflections_do_not_show_is_as_stiff_as_it_is():
+    small = dict(case("vsa-ii").rich, amplitude_nm=0.02, high_hz=1.0)
+    motion = kit.motion("vsa-ii", 15.0, excitation=small)
+    estimates, _ = kit.play(kit.declared("vsa-ii", parameters={}), motion.samples)
+    off = np.abs(estimates.stiffness_nm_rad - motion.stiffness_nm_rad)[-8000:]
+    assert np.mean(estimates.valid[-8000:]) > 0.99
+    assert np.all(off < 3.0 * estimates.std_nm_rad[-8000:])
+    assert np.all(estimates.std_nm_rad[-8000:] < 0.01 * motion.stiffness_nm_rad[-8000:])

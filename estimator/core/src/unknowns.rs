@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 pub use reading::Reading;
 
 use crate::balance::{self};
+use crate::choices::REACHED;
 use crate::gram::{COLUMNS, Frame, Gram, Matrix, Posterior, Row, Set, UNKNOWNS, Vector, set};
 use crate::laws::{Alpha, Law, PARAMETERS};
 use crate::model::{Motor, Transmission};
@@ -94,6 +95,7 @@ pub struct Spring {
     pub known: bool,
     /// α.
     pub alpha: Alpha,
+    linearised: Alpha, // at which its slopes are those of the posterior
     /// Of φ |φ|, N·m/rad²: a corner of the stiffness at zero that a series of odd powers lacks.
     corner: f64,
     /// Where φ is zero, rad: f(φ + zero).
@@ -141,6 +143,7 @@ impl Spring {
             series,
             known: declared,
             alpha,
+            linearised: alpha,
             corner: 0.0,
             zero: 0.0,
             declared,
@@ -153,7 +156,7 @@ impl Spring {
     /// Back to what is declared.
     pub fn reset(&mut self) {
         (self.alpha, self.zero, self.known, self.anchored) = (self.start, 0.0, self.declared, self.declared);
-        self.corner = 0.0;
+        (self.linearised, self.corner) = (self.start, 0.0);
     }
 
     /// It has changed: what is declared is no measure any more.
@@ -250,6 +253,20 @@ impl Spring {
             let near = (0.5 * (before - shape.low), 2.0 * (before - shape.low)); // one step of an iteration
             *value = value.clamp(shape.low + near.0, (shape.low + near.1).min(shape.high));
         }
+        self.linearised = self.alpha;
+        if !shapes.is_empty() {
+            self.linearised = base;
+            // What was found is a torque; k depends on the shape, along a line that is not straight.
+            let (n, ends) =
+                (self.size, [&base, &self.alpha].map(|alpha| self.law.reach(&alpha[1..self.size])));
+            let phi = size.min(REACHED * ends[0].min(ends[1]));
+            let mut slopes = [0.0; PARAMETERS];
+            self.law.jacobian(phi, &base[..n], &mut slopes[..n]);
+            let moved: f64 = slopes[..n].iter().zip(&x[SPRING]).map(|(slope, x)| slope * x).sum();
+            let torque = self.law.at(phi, &base[..n]).0 + moved;
+            self.alpha[0] = 1.0;
+            self.alpha[0] = torque / self.law.at(phi, self.parameters()).0;
+        }
         self.zero += x[ZERO];
         self.corner = x[CORNER.start] / size.powi(2);
         self.known = true;
@@ -261,15 +278,19 @@ impl Spring {
         !self.anchored && !self.law.shapes().is_empty()
     }
 
+    /// A usual shape parameter above its least value: an angle's of the VSA-II, else of a bend over this deflection.
+    fn bend_scale(&self, deflection: f64) -> f64 {
+        if matches!(self.law, Law::VsaII) { 1.0 } else { deflection.recip() }
+    }
+
     /// The shapes from which a law of one shape parameter may begin.
     pub fn starts(&self, deflection: f64) -> impl Iterator<Item = f64> {
         let shape = self.law.shapes().first().copied().filter(|_| self.size == 2);
-        let law = self.law.clone();
+        let (law, scale) = (self.law.clone(), self.bend_scale(deflection));
         (0..SHAPES).filter_map(move |k| {
             let shape = shape?;
             let bend = NARROWEST * (WIDEST / NARROWEST).powf(k as f64 / (SHAPES - 1) as f64);
-            let value =
-                (shape.low + bend / if matches!(law, Law::VsaII) { 1.0 } else { deflection }).min(shape.high);
+            let value = (shape.low + bend * scale).min(shape.high);
             (law.reach(&[value]) > deflection).then_some(value)
         })
     }

@@ -40,13 +40,15 @@ impl Spring {
         let base = self.base();
         let shapes = self.law.shapes();
         for (i, unknown) in SPRING.enumerate().take(self.size) {
-            mean[unknown] = if self.anchored { self.start[i] - base[i] } else { 0.0 };
+            let shape = i.checked_sub(1).and_then(|k| shapes.get(k));
+            // A shape that small deflections do not show stays where it began; its k would be anything.
+            mean[unknown] = if self.anchored || shape.is_some() { self.start[i] - base[i] } else { 0.0 };
             let undeclared = i >= if self.series { USUAL } else { self.least };
-            std[unknown] = match (self.anchored, i.checked_sub(1).and_then(|k| shapes.get(k))) {
+            std[unknown] = match (self.anchored, shape) {
                 _ if undeclared => priors.undeclared * torque / rms(unknown),
                 (true, Some(shape)) => priors.law * (self.start[i] - shape.low),
                 (true, None) if self.start[i] != 0.0 => priors.law * self.start[i].abs(),
-                (false, Some(shape)) => (2.0 * (self.alpha[i] - shape.low)).max(1.0 / deflection),
+                (false, Some(shape)) => (2.0 * (self.start[i] - shape.low)).max(self.bend_scale(deflection)),
                 _ => priors.spring * torque / fluctuation(unknown), // its mean may be a zero that is elsewhere
             };
         }

@@ -34,9 +34,10 @@ impl Spring {
         let at = now + self.zero;
         let (mut by_torque, mut by_stiffness) = ([0.0; UNKNOWNS], [0.0; UNKNOWNS]);
         let (mut f, mut s) = ([0.0; PARAMETERS], [0.0; PARAMETERS]);
-        self.law.jacobian(at, self.parameters(), &mut f[..self.size]);
-        let bend = self.law.stiffness_slopes(at, self.parameters(), &mut s[..self.size])
-            + 2.0 * self.corner * now.signum();
+        let near = &self.linearised[..self.size];
+        self.law.jacobian(at, near, &mut f[..self.size]);
+        let bend =
+            self.law.stiffness_slopes(at, near, &mut s[..self.size]) + 2.0 * self.corner * now.signum();
         by_torque[SPRING.start..SPRING.start + self.size].copy_from_slice(&f[..self.size]);
         by_stiffness[SPRING.start..SPRING.start + self.size].copy_from_slice(&s[..self.size]);
         if set & crate::gram::set(CORNER) != 0 {

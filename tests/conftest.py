@@ -48,13 +48,20 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    # A tenth of the time would go into looking through hundreds of modules for garbage, again and again.
+    # A tenth of the time would go into looking through hundreds of modules for garbage, again and again: `swept`.
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000)
     for item in items:
         if item.path.stem in REAL_TIME:
             item.add_marker(pytest.mark.real_time)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def swept():
+    """What a file leaves is collected before the next one."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture

@@ -40,10 +40,9 @@ REASONS: dict[str, dict[str, str]] = {
         "0.001": "relative change that ends an iteration",
         "0.0001": "likewise, of x",
     },
-    "diagnosis/frame.py": {"0.45": "of the sampling rate: below half of it"},
-    "diagnosis/problem.py": {
+    "diagnosis/frame.py": {
+        "0.45": "of the sampling rate: below half of it",
         "0.01": "quantile of the steps of a reading: one count",
-        "0.7": "place of held-out blocks: not the middle of a period",
     },
     "diagnosis/search.py": {"1.75": "last point of a grid of delays in octaves"},
     "diagnosis/design_matrix.py": {

@@ -256,18 +256,18 @@ def test_the_simplest_within_one_standard_error_is_chosen(gain, best, chosen, mo
     )
     monkeypatch.setattr(Held, "scores", lambda _, one, among=(): one.scores)
     monkeypatch.setattr(Held, "squared", lambda _, one: float(np.mean(np.exp(-2.0 * one.scores))))
-    monkeypatch.setattr(Held, "_least", lambda *_: np.array([4e-6]))
+    monkeypatch.setattr(Held, "_relative", lambda _, floor: np.square(floor))
     monkeypatch.setattr(Held, "_independent", lambda *_: 300.0)
     held: Any = Held.__new__(Held)
-    held.price = 3.0
+    held.price, held.problem = 3.0, SimpleNamespace(floor=choice("floor"))
     for one, families, parameters in zip((simple, other, third), ("a", "ab", "abc"), (2, 3, 4), strict=True):
-        one.families, one.parameters = frozenset(families), parameters
+        one.families, one.parameters, one.regression = frozenset(families), parameters, held.problem
     found = held.simplest([simple, other, third])
     assert found.name == chosen
     assert held.weights([found, other if found is simple else simple], found)[0] > 0.9
     # A law that leaves what laws leave anyway is preferred, but not where it scores less than what is ruled out.
     third.families, third.scores = simple.families, simple.scores + 0.5
-    monkeypatch.setattr(Held, "_least", lambda *_: np.array([10.0]))
+    simple.regression = other.regression = third.regression = SimpleNamespace(floor=3.0)
     assert held.simplest([simple, third]) is simple
     other.families, other.parameters, other.scores = simple.families, simple.parameters, simple.scores + 0.5
     third.scores, third.log_prior = other.scores + np.resize([0.1, -0.12], 10), lambda *_: -8.0

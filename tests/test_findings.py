@@ -13,6 +13,7 @@ import pytest
 
 from drivelink.output.sentences import sentence
 from estimator import fit
+from estimator.choices import choice
 from estimator.diagnosis import Diagnosis, Errors, Finding, diagnose
 from estimator.diagnosis.curves import _bases
 from estimator.diagnosis.heldout import Held
@@ -134,10 +135,11 @@ def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
 ):
     monkeypatch.setattr(Held, "squared", lambda _, one: float(np.mean(one.squares)))
     monkeypatch.setattr(Held, "scores", lambda _, one, among: -0.5 * np.log(one.squares))
-    monkeypatch.setattr(Held, "_least", lambda *_: np.array([4e-4]))
+    monkeypatch.setattr(Held, "_relative", lambda _, floor: np.square(floor))
     held: Any = Held.__new__(Held)
+    held.problem, law = SimpleNamespace(floor=choice("floor")), SimpleNamespace(floor=0.02)
     rest, found = (
-        SimpleNamespace(squares=np.array(x), families=frozenset(), parameters=count)
+        SimpleNamespace(squares=np.array(x), families=frozenset(), parameters=count, regression=law)
         for count, x in enumerate((before, after))
     )
     assert held.confirms(found, rest) is confirmed

@@ -162,3 +162,31 @@ def test_a_link_encoder_that_is_silent_shows_no_spring():
     joint = JointModel(arrangement="single", motors=(replace(ELASTIC, transmission=spring),))
     with pytest.raises(EstimatorError, match="expected a run without gaps"):
         free_run(joints.part(silent, slice(1)), joint)  # one sample neither moves nor stands
+
+
+STIFF = "stiffness=15000 inertia=1.2 damping=8 link_inertia=4 link_damping=3 motor_counts=1638400 seconds=10"
+
+
+def declared(settings: str, **spring: object) -> JointModel:
+    """The joint that these settings make, as its file would declare it."""
+    given = {name: float(x) for name, x in (one.split("=") for one in settings.split()) if name != "motion"}
+    own = {"model": "linear", "parameters": {"k_nm_rad": given["stiffness"]}} | spring
+    motor = Motor(
+        inertia_kg_m2=given["inertia"],
+        viscous_damping_nm_s_rad=given["damping"],
+        transmission=Transmission(**own),
+    )
+    link = LinkDynamics(
+        inertia_kg_m2=given["link_inertia"],
+        viscous_damping_nm_s_rad=given["link_damping"],
+        gravity_nm=given["gravity"],
+    )
+    return JointModel(arrangement="single", motors=(motor,), link=link)
+
+
+@pytest.mark.slow
+def test_rounding_by_a_coarse_encoder_is_no_effect():
+    """13 bits on a stiff gear: a count is 11 N·m, and the arm rests on one of them between its moves."""
+    settings = f"{STIFF} gravity=80 link_bits=13 motion=point-to-point size=1"
+    found = diagnose(simulated(settings).record, declared(settings))
+    assert found.verdict == "sufficient", [(one.name, one.parameters) for one in found.effects]

@@ -116,7 +116,7 @@ def _offsets(problem: Problem, found: Fitted, std: FloatArray) -> list[Finding]:
             continue
         size = -float(np.mean(constant[problem.group % problem.equations == i]))
         stiffness = problem.at(found.corrections, found.base)[0].motors[i].stiffness
-        if abs(size) < float(np.mean(stiffness)) * problem.resolution_rad(i):
+        if abs(size) < float(np.mean(stiffness)) * problem.signals[0].resolution_rad[i]:
             continue
         deviation = float(np.hypot.reduce(std[[j for j in mine if found.slots[j].name == "torque_offset"]]))
         return [

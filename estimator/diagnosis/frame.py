@@ -21,7 +21,7 @@ from estimator.effects import Coordinates
 from estimator.model import JointModel, LinkDynamics
 from estimator.sample import FloatArray, Record
 
-__all__ = ["Corrections", "Frame", "Signals"]
+__all__ = ["Corrections", "Frame", "Signals", "count_of"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +64,7 @@ class Signals:
         bandwidth_hz: of F.
 
     Attributes:
+        resolution_rad: of each motor's deflection: one count of each of its encoders.
         memo: columns that depend on the motors' motion alone, by effect and shape (`candidates.columns`).
     """
 
@@ -85,6 +86,9 @@ class Signals:
         self.theta = [self.light.transform(bridged(x)) for x in record.motor_position_rad.T]
         self.tau = [self.light.transform(bridged(x)) for x in record.motor_torque_nm.T]
         self.q = None if link is None else self.light.transform(bridged(link))
+        self._counts = [count_of(x) for x in record.motor_position_rad.T]
+        self._link_count = 0.0 if link is None else count_of(link)
+        self.resolution_rad = tuple(count + self._link_count for count in self._counts)
         external = record.external_torque_nm
         self.external = None if external is None else self.light.transform(bridged(external))
         rows_step = max(1, int(1.0 / (self.light.period_s * rate() * bandwidth_hz)))
@@ -147,6 +151,29 @@ class Signals:
             keep &= (time < before * record.period_s - edge) | (time > after * record.period_s + edge)
         return keep
 
+    @functools.cached_property
+    def rounding_rad(self) -> tuple[float, ...]:
+        """Rms error of each motor's deflection by rounding, within the bandwidth."""
+        link = 0.0 if self.q is None else self._rounded(self.q, self._link_count)
+        pairs = zip(self.theta, self._counts, strict=True)
+        return tuple(float(np.hypot(self._rounded(x, count), link)) for x, count in pairs)
+
+    def _rounded(self, spectrum: Spectrum, count: float) -> float:
+        """Rms that rounding leaves of a reading in the rows, over all places of its counts.
+
+        It is c / sqrt(12) where the reading rests, and averages out where it passes many counts.
+        """
+        if not count:
+            return 0.0
+        time, points = np.arange(self.samples) * self.period_s, np.arange(self.light.kept)
+        path = np.interp(time, points * self.light.period_s, self.light.apply(spectrum, self._smooth)) / count
+        squares = []
+        for place in np.arange(whole("groups")) / whole("groups"):
+            error = np.floor(path + place) + 0.5 - path - place
+            smooth = self.light.apply(self.light.transform(error), self._smooth)
+            squares.append(np.mean(self.narrow.filter(smooth, self.response)[self.keep] ** 2))
+        return count * float(np.sqrt(np.mean(squares)))
+
     def noise(self, spectrum: Spectrum, response: NDArray[Any]) -> float:
         """Return the variance of a channel's white noise after a filter; the noise is read
         from the upper end.
@@ -174,6 +201,12 @@ class Signals:
             return accelerated
         read = self.noise(self.theta[motor], response) + self.noise(self.q, response)
         return accelerated + float(np.mean(stiffness**2)) * read
+
+
+def count_of(reading: FloatArray) -> float:
+    """Return the resolution of a reading (n,), from its steps."""
+    steps = np.abs(np.diff(reading))
+    return float(np.quantile(steps[steps > 0.0], 0.01)) if np.any(steps > 0.0) else 0.0
 
 
 def _lag(frequency_hz: FloatArray, time_constant_s: float) -> NDArray[Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from estimator.choices import choice, whole
+from estimator.choices import whole
 from estimator.diagnosis.candidates import members
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.problem import Problem, stretches
@@ -114,15 +114,15 @@ class Held:
         if key not in self._squares:
             own, other = self._residuals(fitted)
             self._squares[key] = np.concatenate([self._by_stretch(one) for one in own + other])
-        least = np.full(self.problem.equations, choice("floor") ** 2)
+        least = self._relative(self.problem.floor)
         for one in among:
-            least = np.maximum(least, self._least(one))
+            least = np.maximum(least, self._relative(one.regression.floor))
         return np.asarray(-0.5 * np.sum(np.log(self._squares[key] + least), axis=1))
 
-    def _least(self, fitted: Fitted) -> FloatArray:
-        """(balances,) mean square that a model's laws leave, relative to the torque's."""
-        floor = fitted.regression.floor.reshape(-1, self.problem.equations)
-        return np.asarray(np.mean(floor**2, axis=0) / self.problem.torque_rms**2)
+    def _relative(self, floor: FloatArray) -> FloatArray:
+        """(balances,) mean square of a floor (groups,), relative to the torque's."""
+        square = floor.reshape(-1, self.problem.equations) ** 2
+        return np.asarray(np.mean(square, axis=0) / self.problem.torque_rms**2)
 
     def _by_stretch(self, one: Residual) -> FloatArray:
         """(stretches, balances) mean squared error, relative to the recording's torque."""
@@ -141,8 +141,8 @@ class Held:
 
     def margin(self, found: Fitted, rest: Fitted) -> float:
         """Return how many times more than `confirms` asks for one model gains over another."""
-        least = float(np.mean(self._least(rest))) if _refines(found, rest) else choice("floor") ** 2
-        fall = (self.squared(rest) - self.squared(found)) / least
+        floor = rest.regression.floor if _refines(found, rest) else self.problem.floor
+        fall = (self.squared(rest) - self.squared(found)) / float(np.mean(self._relative(floor)))
         both = found, rest
         return min(fall, _in_errors(self.scores(found, both) - self.scores(rest, both)))
 
@@ -185,7 +185,7 @@ class Held:
             for one in models
             if one.families == found.families
             and one.parameters < found.parameters
-            and self.squared(one) - most < float(np.mean(self._least(one)))
+            and self.squared(one) - most < float(np.mean(self._relative(one.regression.floor)))
             and score(one) > least
         ]
         return max([found, *laws], key=lambda one: one.log_prior(errors, self.price))

@@ -80,8 +80,11 @@ def _of_run_std(frames: Sequence[Frame], candidate: Candidate, torque_rms: float
     phi = frames[0].motors[motor].deflection
     if calibrating:  # a healthy joint's encoders may start anywhere
         return std * float(np.ptp(phi) + abs(np.mean(phi)))
-    # The remainder of a zero that has been set is not an effect: half an encoder count is as large.
-    return choice("floor") * float(np.std(phi)) if linked else std * float(np.ptp(phi))
+    if not linked:
+        return std * float(np.ptp(phi))
+    # What is left of a zero that has been set is no effect, nor is what rounding leaves: half a count.
+    rounded = 0.5 * max(f.signals.resolution_rad[motor] for f in frames)
+    return max(choice("floor") * float(np.std(phi)), rounded)
 
 
 def _of_motor_std(

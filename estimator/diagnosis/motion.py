@@ -21,10 +21,11 @@ from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import Candidate, grid
 from estimator.diagnosis.design_matrix import Term
 from estimator.diagnosis.fourier import Limits, Shape
+from estimator.diagnosis.frame import count_of
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.law_parameters import start
-from estimator.diagnosis.problem import Problem, count_of
+from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
 from estimator.driven import driven

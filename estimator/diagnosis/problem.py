@@ -27,7 +27,7 @@ from estimator.errors import EstimatorError
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
-__all__ = ["Problem", "count_of", "stretches"]
+__all__ = ["Problem", "stretches"]
 
 
 class Problem:
@@ -81,9 +81,21 @@ class Problem:
             ]
         )
         self.torque_rms = float(np.sqrt(np.mean(torque**2)))
+        self._begin = start(max(frames, key=lambda f: max(float(np.ptp(c.deflection)) for c in f.motors)))
+        self.floor = self._least()
         self.smoothing_rad_s = max(
             signals.velocity_noise(i) for signals in self.signals for i in range(len(model.motors))
         )
+
+    def _least(self) -> FloatArray:
+        """(groups,) what filters leave of the torque anyway, and rounding of the springs', N·m."""
+        made: list[float] = []
+        for frame in self.frames:
+            motors = with_flexibility(frame, self._begin).motors
+            pairs = zip(motors, frame.signals.rounding_rad, strict=True)
+            rounded = [float(np.sqrt(np.mean(c.stiffness**2))) * angle for c, angle in pairs]
+            made += rounded + [float(np.linalg.norm(np.array(rounded)[list(frame.pulls)]))] * frame.linked
+        return np.hypot(choice("floor") * self.torque_rms, made)
 
     def alike(self, records: Sequence[Record]) -> Problem:
         """Return the same joint and filter with other recordings."""
@@ -94,12 +106,6 @@ class Problem:
     def period_s(self) -> float:
         """The longest sampling period."""
         return max(signals.period_s for signals in self.signals)
-
-    def resolution_rad(self, motor: int) -> float:
-        """Return the resolution of a deflection: one count of each of its encoders."""
-        link = self.records[0].link_position_rad
-        read = [self.records[0].motor_position_rad[:, motor], *([] if link is None else [link])]
-        return sum(map(count_of, read))
 
     def unit_of(self, term: Term, name: str) -> float:
         """Return a nonlinear parameter's unit per unit of its slot."""
@@ -132,8 +138,7 @@ class Problem:
     def null(self, pinned: Pinned | None = None) -> Fitted:
         """Return the fitted declared model, everyday errors within their priors or pinned."""
         corrections = tuple(self.declared for _ in self.signals)
-        widest = max(self.frames, key=lambda f: max(float(np.ptp(c.deflection)) for c in f.motors))
-        return self.fit((), start(widest), corrections, pinned=pinned)
+        return self.fit((), self._begin, corrections, pinned=pinned)
 
     def numbers(self, like: Fitted | None = None) -> Pinned:
         """Return the declared numbers, pinned as they are declared or as another hypothesis has them."""
@@ -243,7 +248,7 @@ class Problem:
             np.array(stack.std),
             np.array(stack.low),
             self.group,
-            np.full(groups, choice("exact" if self.calibrating else "floor") * self.torque_rms),
+            np.full(groups, choice("exact") * self.torque_rms) if self.calibrating else self.floor,
             stack.scales(terms),
         )
         times = np.ones(groups)
@@ -261,7 +266,7 @@ class Problem:
     def _floor(self, regression: Regression, slots: list[Slot], x: FloatArray) -> FloatArray:
         """(groups,) noise floor: rounding, and the typical error of an effect's law."""
         effect = [j for j, s in enumerate(slots) if s.kind == "term" and LIBRARY[s.name].nonlinear]
-        square = np.full(len(regression.floor), (choice("floor") * self.torque_rms) ** 2)
+        square = self.floor**2
         torque = regression.design[:, effect] @ x[effect]
         for g in range(len(square)):
             square[g] += choice("law") ** 2 * float(np.mean(torque[self.group == g] ** 2))
@@ -282,12 +287,6 @@ class Problem:
                 for run in range(len(corrections)) if slot.run is None else (slot.run,):
                     corrections[run] = corrected(corrections[run], slot.name, slot.motor, slot.part, value)
         return tuple(terms), base, tuple(corrections)
-
-
-def count_of(reading: FloatArray) -> float:
-    """Return the resolution of a reading (n,), from its steps."""
-    steps = np.abs(np.diff(reading))
-    return float(np.quantile(steps[steps > 0.0], 0.01)) if np.any(steps > 0.0) else 0.0
 
 
 def stretches(problem: Problem) -> NDArray[np.int64]:

@@ -7,12 +7,13 @@ import fleetkit
 import joints
 import numpy as np
 import pytest
+import simjoints
 
 from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.output import plots
 from drivelink.output.fitreport import fit_plot
-from estimator import EstimatorError, Record, Status, fit
+from estimator import EstimatorError, JointModel, LinkDynamics, Motor, Record, Status, Transmission, fit
 from estimator.transmissions import MODELS
 
 T = 1e-3
@@ -202,3 +203,23 @@ def test_of_a_joint_that_a_hand_guides_no_stiffness_is_stated():
     (found,) = fit(record, joints.joint_model(0.12, 0.8))
     assert not found.excited and not found.parameters
     assert abs(found.alpha[0] - 150.0) < 2.0 * np.sqrt(found.covariance[0, 0])
+
+
+def test_the_spring_of_a_serial_joint_bears_on_the_motor_that_sets_its_lever():
+    """Nobody declares the lever: undeclared, all that its motor bears would be unexplained."""
+    rows = simjoints.measured(simjoints.sea(motors=2, lever=0.1), seconds=8.0)
+    motors = [
+        np.stack([rows[f"motor{i}_{x}"] for i in (1, 2)], axis=1) for x in ("position_rad", "torque_nm")
+    ]
+    record = Record(
+        period_s=T, sequence=np.arange(8000), motor_position_rad=motors[0], motor_torque_nm=motors[1],
+        link_position_rad=rows["link_position_rad"],
+    )  # fmt: skip
+    declared = tuple(
+        Motor(inertia_kg_m2=0.125, viscous_damping_nm_s_rad=0.8, transmission=Transmission(model=model))
+        for model in ("linear", "none")
+    )
+    link = LinkDynamics(inertia_kg_m2=0.4, viscous_damping_nm_s_rad=0.1, gravity_nm=6.0)
+    carrying, setting = fit(record, JointModel(arrangement="serial", motors=declared, link=link))
+    assert abs(carrying.alpha[0] - 150.0) < 1.0
+    assert setting.error_rms_nm < 0.001 * setting.torque_rms_nm

@@ -134,6 +134,14 @@ class Stack:
                 self._add(design[:, j], slot, wide / _rms_of(design[:, j]), low=low)
                 j += 1
 
+    def lever(self, base: Base) -> None:
+        """Add the lever of a serial joint, which no file declares, about its mean in the first recording."""
+        if self._model.arrangement == "serial" and self._frames[0].flexible[0]:
+            held = float(np.mean(self._frames[0].motors[1].position))
+            column = np.concatenate([base.lever(f, held) for f in self._frames])
+            width = PRIORS["transmission"].std * self._torque_rms / _rms_of(column)
+            self._add(column, Slot("everyday", "lever", 1, None, 0, 0, 0.0), width)
+
     def everyday(self, without: set[tuple[str, int | None]], pinned: Pinned) -> None:
         """Add the everyday errors that are not terms."""
         for candidate in everyday(self._frames[0]):

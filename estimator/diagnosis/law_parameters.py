@@ -9,7 +9,7 @@ import numpy as np
 from estimator.choices import whole
 from estimator.diagnosis.frame import Frame
 from estimator.errors import EstimatorError
-from estimator.model import ParameterValue
+from estimator.model import HIGHEST_ORDER, ParameterValue
 from estimator.sample import FloatArray
 from estimator.transmissions import TransmissionModel, transmission_model
 
@@ -48,6 +48,24 @@ class Base:
                 torque = model.torque(frame.motors[i].deflection, self.alpha[i])
                 total = total + frame.column(i, torque, torque if frame.pulls[i] else None)
         return total
+
+    def lever(self, frame: Frame, held_rad: float) -> FloatArray:
+        """Return the column of a serial joint's lever, 1/rad at one position of the second motor.
+
+        From U = (1 + l (theta_2 - held))² F(phi), to the first order in l: tau_e grows by
+        2 (theta_2 - held) f, and the second motor bears -2 F. The quadrature of F, the integral of f, is
+        exact for every polynomial of a joint file.
+        """
+        model, (first, second) = self.models(frame)[0], frame.motors
+        assert model is not None
+        nodes, weights = np.polynomial.legendre.leggauss(HIGHEST_ORDER)
+        phi = first.deflection
+        energy = sum(
+            0.5 * w * phi * model.torque(0.5 * (1.0 + x) * phi, self.alpha[0])
+            for x, w in zip(nodes.tolist(), weights.tolist(), strict=True)
+        )
+        more = 2.0 * (second.position - held_rad) * model.torque(phi, self.alpha[0])
+        return np.asarray(frame.column(0, more, more) - frame.column(1, 2.0 * np.asarray(energy), None))
 
     def moved(self, frame: Frame, step: FloatArray) -> Base:
         """Return alpha plus a step, with shape parameters limited to their bounds."""

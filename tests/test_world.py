@@ -190,3 +190,14 @@ def test_rounding_by_a_coarse_encoder_is_no_effect():
     settings = f"{STIFF} gravity=80 link_bits=13 motion=point-to-point size=1"
     found = diagnose(simulated(settings).record, declared(settings))
     assert found.verdict == "sufficient", [(one.name, one.parameters) for one in found.effects]
+
+
+SOFT = "stiffness=150 inertia=0.12 damping=0.8 link_inertia=0.45 link_damping=0.5 motor_counts=819200"
+
+
+@pytest.mark.slow
+def test_a_weight_that_nobody_declares_is_no_contact():
+    """What touches always is no contact: no touch was seen."""
+    settings = f"{SOFT} gravity=15.6 pull=10.8 size=4.8 seconds=12 seed=10"
+    effects = diagnose(simulated(settings).record, declared(settings)).effects
+    assert effects and "contact" not in [effect.name for effect in effects]

@@ -313,7 +313,7 @@ def reach_of(frame: Frame, candidate: Candidate, name: str) -> float | None:
 
 
 def bounds_of(frame: Frame, candidate: Candidate, name: str, values: Values) -> tuple[float, float]:
-    """Bounds of a positive nonlinear parameter beside the others: resolved, and within the motion."""
+    """Bounds of a nonlinear parameter beside the others: resolved, and within the motion."""
     c = frame.motors[candidate.motor or 0]
     fast = float(np.max(np.abs(c.link_velocity if candidate.motor is None else c.velocity)))
     if name == "smoothing_rad_s":
@@ -322,6 +322,8 @@ def bounds_of(frame: Frame, candidate: Candidate, name: str, values: Values) -> 
         return least, min(most, values.get("stribeck_velocity_rad_s", np.inf) / choice("sure"))
     if name == "stribeck_velocity_rad_s":
         return choice("sure") * values["smoothing_rad_s"], fast
+    if name == "position_rad":  # beyond the motion, what is touched always or never is no contact
+        return float(np.min(c.link_position)), float(np.max(c.link_position))
     if name == "exponent":
         return 1.0, 20.0
     if name == "shape":

@@ -178,7 +178,8 @@ class Stack:
         if term.weights:
             for name in term.free:
                 slot = Slot("shape", name, candidate.motor, None, k, 0, 0.0)
-                self._add(self._derivative(term, name), slot, 1.0)
+                width = choice("exact") if self._ends(term, name) else 1.0
+                self._add(self._derivative(term, name), slot, width)
 
     def curve(self, extra: Extra) -> None:
         """Build a free curve."""
@@ -227,6 +228,12 @@ class Stack:
         now, before = read(self._corrections[run], candidate), read(self._declared, candidate)
         return np.subtract(now, before)
 
+    def _ends(self, term: Term, name: str) -> bool:
+        """Whether a place is at an end of the motion, beyond which the effect is none."""
+        low, high = bounds_of(self._frames[0], term.candidate, name, term.values)
+        step, _ = step_of(term, name, self._frames[0])
+        return name in _SIGNED and not low + step < term.values[name] < high - step
+
     def _derivative(self, term: Term, name: str) -> FloatArray:
         """Column of a nonlinear parameter, by a difference."""
         step, scale = step_of(term, name, self._frames[0])
@@ -262,13 +269,14 @@ def step_of(term: Term, name: str, frame: Frame) -> tuple[float, float]:
 def stepped(term: Term, name: str, x: float, frame: Frame) -> dict[str, float]:
     """Return the nonlinear parameters after a step; positive ones change by factors of at most two."""
     value, scale = term.values[name], reach_of(frame, term.candidate, name)
+    low, high = bounds_of(frame, term.candidate, name, term.values)
     if scale is None:
-        low, high = bounds_of(frame, term.candidate, name, term.values)
         moved = value * float(np.exp(np.clip(x, -0.7, 0.7)))
         return {**term.values, name: float(np.clip(moved, min(low, value), max(high, value)))}
     most = spread_of(frame, term.candidate, name)
     moved = value + float(np.clip(x * scale, -most, most))
-    return {**term.values, name: moved if name in _SIGNED else max(moved, 0.5 * value)}
+    least = low if name in _SIGNED else 0.5 * value
+    return {**term.values, name: min(max(moved, least), high)}
 
 
 def _of_run(parts: list[FloatArray], p: int, run: int | None) -> FloatArray:

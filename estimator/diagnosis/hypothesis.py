@@ -95,11 +95,13 @@ class Fitted:
         return -0.5 * float(off @ off) - effects
 
     def is_real_beside(self, parent: Fitted) -> bool:
-        """Return whether every effect contributes, and no spring is at zero that has a
-        stiffness in the parent.
+        """Return whether every effect contributes, none at an end of the motion, and no spring is at zero
+        that has a stiffness in the parent.
         """
         lost = self._at_zero("base") - parent._at_zero("base")
-        return not lost and not self._at_zero("term")
+        widths = zip(self.slots, self.regression.std.tolist(), strict=True)
+        ends = any(slot.kind == "shape" and width < 1.0 for slot, width in widths)
+        return not lost and not ends and not self._at_zero("term")
 
     def _at_zero(self, kind: str) -> set[tuple[str, int | None, int]]:
         """Parameters of a kind that their sign constraint holds at its bound."""

@@ -21,12 +21,13 @@ from estimator.diagnosis.findings import DELAYS, stamped_wrongly
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.heldout import Held, held_out
 from estimator.diagnosis.hypothesis import Fitted
+from estimator.diagnosis.order import ordered
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
 from estimator.gate import check, without_hold
-from estimator.model import HIGHEST_ORDER, JointModel, ParameterValue, Transmission
+from estimator.model import JointModel, ParameterValue, Transmission
 from estimator.sample import SIGMA_95, FloatArray, Record
 from estimator.transmissions import MODELS, RIGID, UNKNOWN, TransmissionModel
 
@@ -182,7 +183,9 @@ def fit_joint(
     most = widest(max(one.period_s for one in usable))
     if not 0.0 < bandwidth_hz <= most:
         raise EstimatorError(f"bandwidth: expected more than 0 and at most {most:g} Hz, got {bandwidth_hz:g}")
-    problem, fitted = _ordered(usable, _bare(model), bandwidth_hz)
+    problem, fitted = ordered(
+        _bare(model), lambda model, like: _joint_problem(usable, model, bandwidth_hz, like)
+    )
     held = held_out(problem)
     surplus = held.surplus(fitted)
     free = JointFit(problem, held, surplus, fitted, _covariance(problem, fitted, surplus))
@@ -223,25 +226,6 @@ def _bare(model: JointModel) -> JointModel:
         return replace(own, model=name, parameters={}, covariance=None)
 
     return replace(model, motors=tuple(replace(m, transmission=open_(m.transmission)) for m in model.motors))
-
-
-def _ordered(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> tuple[Problem, Fitted]:
-    """The best fit; each undeclared polynomial order is raised for as long as the evidence rises."""
-    problem = _joint_problem(records, model, bandwidth_hz)
-    fitted = problem.null()
-    for i, motor in enumerate(model.motors):
-        if motor.transmission.model != "polynomial" or motor.transmission.order is not None:
-            continue
-        for order in range(1, HIGHEST_ORDER + 1):
-            own = replace(motor, transmission=replace(motor.transmission, order=order))
-            motors = (*problem.model.motors[:i], own, *problem.model.motors[i + 1 :])
-            one = _joint_problem(records, replace(problem.model, motors=motors), bandwidth_hz, problem)
-            raised = one.null()
-            closest = min((fitted, raised), key=lambda h: float(np.sum(np.log(h.posterior.sigma))))
-            if order > 1 and raised.evidence(closest) <= fitted.evidence(closest):
-                break
-            problem, fitted = one, raised
-    return problem, fitted
 
 
 def _aligned(free: JointFit) -> JointFit:

@@ -17,7 +17,7 @@ from estimator.choices import choice
 from estimator.diagnosis import Diagnosis, Errors, Finding, diagnose
 from estimator.diagnosis.curves import _bases
 from estimator.diagnosis.heldout import Held
-from estimator.diagnosis.order import raised
+from estimator.diagnosis.order import bends
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.verdict import Judge, _Judged
@@ -190,11 +190,15 @@ def stiffening(power: float) -> Finding:
     return Finding(name="higher_order_stiffness", location="transmission", motor=0, parameters=values, std={})
 
 
-@pytest.mark.parametrize(("power", "order"), [(3.0, 2), (5.0, 3)])
-def test_an_open_order_follows_the_power_that_was_found(power, order):
-    model = raised(joint(Transmission(model="polynomial")), [stiffening(power)])
-    assert model is not None
-    assert model.motors[0].transmission.order == order
+UNLISTED = Finding(
+    name="unlisted", location="transmission", motor=0, parameters={}, std={},
+    coordinates=("deflection", "deflection_rate"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("found", [stiffening(3.0), UNLISTED])
+def test_a_curve_of_the_deflection_belongs_to_a_spring_of_open_order(found):
+    assert bends(joint(Transmission(model="polynomial")), [found])
 
 
 @pytest.mark.parametrize(
@@ -203,8 +207,9 @@ def test_an_open_order_follows_the_power_that_was_found(power, order):
         (Transmission(model="polynomial", order=1), [stiffening(3.0)]),
         (Transmission(model="polynomial", parameters={"coefficients_nm_rad": (150.0,)}), [stiffening(3.0)]),
         (Transmission(model="vsa-ii"), [stiffening(3.0)]),
+        (Transmission(model="linear"), [UNLISTED]),
         (Transmission(model="polynomial"), []),  # nothing to raise it for
     ],
 )
 def test_what_the_joint_file_says_is_left_and_the_effect_stays_an_effect(transmission, found):
-    assert raised(joint(transmission), found) is None
+    assert not bends(joint(transmission), found)

@@ -201,3 +201,11 @@ def test_a_weight_that_nobody_declares_is_no_contact():
     settings = f"{SOFT} gravity=15.6 pull=10.8 size=4.8 seconds=12 seed=10"
     effects = diagnose(simulated(settings).record, declared(settings)).effects
     assert effects and "contact" not in [effect.name for effect in effects]
+
+
+@pytest.mark.slow
+def test_a_polynomial_of_open_order_follows_any_spring():
+    settings = f"{SOFT} gravity=3 size=7 seconds=12"
+    record = simulated(f"spring=exponential exponent=15 {settings}").record
+    found = diagnose(record, declared(settings, model="polynomial", parameters={}))
+    assert found.verdict == "sufficient" and found.transmissions[0].parameters

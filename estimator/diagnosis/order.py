@@ -2,39 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
+import numpy as np
+
+from estimator.diagnosis.hypothesis import Fitted
+from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Finding
-from estimator.model import JointModel, Motor
+from estimator.model import HIGHEST_ORDER, JointModel, Transmission
 
-__all__ = ["raised"]
+__all__ = ["bends", "ordered"]
 
 
-def raised(model: JointModel, effects: Iterable[Finding]) -> JointModel | None:
-    """Return the model with open orders raised to those found by a diagnosis (eq 24).
+def _is_open(own: Transmission) -> bool:
+    return own.model == "polynomial" and own.order is None and not own.parameters
+
+
+def bends(model: JointModel, effects: Iterable[Finding]) -> bool:
+    """Return whether a diagnosis has found a curve of the deflection, of which the order is open."""
+    return any(
+        (f.name == "higher_order_stiffness" or f.coordinates[:1] == ("deflection",))
+        and _is_open(model.motors[f.motor or 0].transmission)
+        for f in effects
+    )
+
+
+def ordered(
+    model: JointModel, make: Callable[[JointModel, Problem | None], Problem]
+) -> tuple[Problem, Fitted]:
+    """Return the best fit; each open order is raised for as long as the evidence rises (eq 24).
 
     Args:
-        model: as it was diagnosed.
-        effects: what the diagnosis has found missing.
-
-    Returns:
-        The model with raised orders; None if there is nothing to raise.
+        model: the joint.
+        make: the problem of a model, like another one.
     """
-    powers = {
-        finding.motor: finding.parameters["power"]
-        for finding in effects
-        if finding.name == "higher_order_stiffness"
-    }
-    motors = [_raised(motor, powers.get(index)) for index, motor in enumerate(model.motors)]
-    return replace(model, motors=tuple(motors)) if tuple(motors) != model.motors else None
-
-
-def _raised(motor: Motor, power: object) -> Motor:
-    transmission = motor.transmission
-    is_open = (
-        transmission.model == "polynomial" and transmission.order is None and not transmission.parameters
-    )
-    if not is_open or not isinstance(power, float):
-        return motor
-    return replace(motor, transmission=replace(transmission, order=round((power + 1) / 2)))
+    problem = make(model, None)
+    fitted = problem.null()
+    for i, motor in enumerate(model.motors):
+        if not _is_open(motor.transmission):
+            continue
+        for order in range(1, HIGHEST_ORDER + 1):
+            own = replace(motor, transmission=replace(motor.transmission, order=order))
+            motors = (*problem.model.motors[:i], own, *problem.model.motors[i + 1 :])
+            one = make(replace(problem.model, motors=motors), problem)
+            raised = one.null()
+            closest = min((fitted, raised), key=lambda h: float(np.sum(np.log(h.posterior.sigma))))
+            if order > 1 and raised.evidence(closest) <= fitted.evidence(closest):
+                break
+            problem, fitted = one, raised
+    return problem, fitted

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from estimator.choices import least_rows
 from estimator.diagnosis.bandwidth import choose_bandwidth, widest
 from estimator.diagnosis.heldout import held_out
-from estimator.diagnosis.order import raised
+from estimator.diagnosis.order import bends, ordered
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
@@ -54,10 +54,13 @@ def diagnose(
     most = widest(max(r.period_s for r in records))
     if not 0.0 < bandwidth <= most:
         raise EstimatorError(f"bandwidth: expected more than 0 and at most {most:g} Hz, got {bandwidth:g}")
-    problem = Problem(records, model, bandwidth, least=least_rows())
+
+    def made(model: JointModel, like: Problem | None = None) -> Problem:
+        return Problem(records, model, bandwidth, least=least_rows(), like=like)
+
+    problem = made(model)
     search = Search(problem, held_out(problem, validation), progress)
     outcome = Judge(search, search.run(), progress).diagnosis()
-    higher = raised(model, outcome.effects)
-    if higher is not None:
-        return diagnose(records, higher, bandwidth, validation, progress)
+    if bends(model, outcome.effects):
+        return diagnose(records, ordered(model, made)[0].model, bandwidth, validation, progress)
     return outcome

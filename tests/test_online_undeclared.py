@@ -1,12 +1,15 @@
 """What nobody declared: a held motor's friction, springs that bend, a shape that the motion does not show."""
 
 import heldmotor
+import joints
 import numpy as np
 import onlinekit as kit
 import pytest
 
 from sim.cases import case
 from sim.effects import make
+
+T = 1e-3
 
 
 def test_the_interval_of_a_held_motor_holds_what_friction_takes_from_the_stiffness():
@@ -43,3 +46,17 @@ def test_a_vsa_whose_shape_small_deflections_do_not_show_is_as_stiff_as_it_is():
     assert np.mean(estimates.valid[-8000:]) > 0.99
     assert np.all(off < 3.0 * estimates.std_nm_rad[-8000:])
     assert np.all(estimates.std_nm_rad[-8000:] < 0.01 * motion.stiffness_nm_rad[-8000:])
+
+
+def test_a_spring_of_another_stiffness_on_either_side_is_named_and_right():
+    def stiffness(phi):
+        return np.where(phi > 0.0, 195.0, 105.0)
+
+    plants = joints.Plants(lambda phi: stiffness(phi) * phi, stiffness, 0.12, 0.8, 0.45, 0.3, 3.0)
+    truth = joints.simulate(plants, joints.sweep(np.random.default_rng(3), 12000, 1, 1, T, 8.0, 3.0), T)
+    joint = joints.joint_model(0.12, 0.8, model="polynomial", order=1, parameters={})
+    out = joints.estimates(joint, joints.record(truth, 0, T))[-6000:]
+    torque = truth.tau_e[-6000:, 0, 0]
+    assert np.mean(out[:, 1].astype(int) & kit.VALID > 0) > 0.99
+    assert np.sqrt(np.mean((out[:, 2] - torque) ** 2)) < 0.02 * np.sqrt(np.mean(torque**2))
+    assert np.median(np.abs(out[:, 3] / truth.sigma[-6000:, 0, 0] - 1.0)) < 0.005

@@ -27,8 +27,8 @@ pub const DRY: usize = 5;
 pub const SOFT: usize = 6;
 /// |b₁| and |b₂| times the sign of θ′: friction of the load, N·m.
 pub const LOAD: [usize; 2] = [7, 23];
-/// −φ′: damping of the transmission, N·m·s/rad.
-pub const RATE: usize = 8;
+/// −|u|: a spring that is stiffer to one side, N·m.
+pub const UNEVEN: usize = 8;
 /// −bₖ: the spring, N·m.
 pub const SPRING: std::ops::Range<usize> = 9..9 + TERMS;
 /// −bₖ′: a spring whose zero is elsewhere, N·m.
@@ -46,7 +46,7 @@ pub const CORNER: usize = 31;
 
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
-const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len() + 1; // columns that are functions of the raw φ
+const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len() + 2; // columns that are functions of the raw φ
 const FORMED: usize = 9; // columns of lightly filtered signals: dry, soft, load ×2, late, read, stops ×3
 
 /// What the columns are scaled by, taken from the motion.
@@ -175,7 +175,8 @@ impl Balance {
             let width = width * self.size.range;
             *value = if width > 0.0 { -phi.clamp(-width, width) / self.size.range } else { 0.0 };
         }
-        out[CURVE - 1] = -self.unit(phi) * self.unit(phi).abs();
+        let u = self.unit(phi);
+        (out[CURVE - 2], out[CURVE - 1]) = (-u.abs(), -u * u.abs());
         out
     }
 
@@ -215,7 +216,7 @@ impl Balance {
         }
         (self.size.range, self.size.speed) = (range, self.speed);
         let columns = self.curve_columns(phi);
-        for lane in 2 * TERMS..CURVE - 1 {
+        for lane in 2 * TERMS..CURVE - 2 {
             for state in self.light.state.iter_mut().chain(&mut self.curve.state) {
                 state[lane] = 0.0;
             }
@@ -246,8 +247,9 @@ impl Balance {
         LOAD.iter().zip(&terms).for_each(|(column, factor)| factors[*column] = *factor);
         let mut curve = [1.0; CURVE];
         curve[..2 * TERMS].copy_from_slice(&terms);
-        let corner = (before / self.size.deflection).powi(2);
-        (factors[CORNER], curve[CURVE - 1]) = (corner, corner);
+        let ratio = before / self.size.deflection;
+        (factors[UNEVEN], curve[CURVE - 2]) = (ratio, ratio);
+        (factors[CORNER], curve[CURVE - 1]) = (ratio * ratio, ratio * ratio);
         self.light.scale(&curve);
         self.curve.scale(&curve);
         let slope = terms[TERMS + 1];
@@ -304,11 +306,10 @@ impl Balance {
         row[ACCELERATION] = self.position.main[2];
         row[VELOCITY] = self.position.main[1];
         row[OFFSET] = 1.0;
-        row[RATE] = self.position.main[1] - link.main[1];
         let curve = &self.curve.state[0];
         row[SPRING.start..SPRING.start + 2 * TERMS].copy_from_slice(&curve[..2 * TERMS]);
-        row[CLIPS].copy_from_slice(&curve[2 * TERMS..CURVE - 1]);
-        row[CORNER] = curve[CURVE - 1];
+        row[CLIPS].copy_from_slice(&curve[2 * TERMS..CURVE - 2]);
+        (row[UNEVEN], row[CORNER]) = (curve[CURVE - 2], curve[CURVE - 1]);
         (row[LATE.start], row[READ.start]) = (-link.main[1], -link.main[0]);
         let formed = &self.formed.state[0];
         let places = [DRY, SOFT, LOAD[0], LOAD[1], LATE.start + 1, READ.start + 1];

@@ -41,7 +41,7 @@ pub const STOPS: std::ops::Range<usize> = 16..19;
 pub const CLIPS: std::ops::Range<usize> = 19..23;
 /// A corner of the stiffness at zero, N·m at the largest deflection.
 pub const CORNER: std::ops::Range<usize> = 23..24;
-/// A spring that is stiffer to one side: of |φ|, N·m/rad, and of φ², N·m/rad².
+/// A spring that is stiffer to one side: of |φ|, N·m at the largest deflection, and of φ², N·m/rad².
 pub const ASYMMETRY: std::ops::Range<usize> = 24..26;
 
 /// Those that every joint has.
@@ -306,7 +306,9 @@ impl Spring {
             (OFFSET, balance::OFFSET),
             (DRY, balance::DRY),
             (SOFT, balance::SOFT),
-            (RATE, balance::RATE),
+            (RATE, balance::VELOCITY),
+            (RATE, balance::LATE.start), // −q′
+            (ASYMMETRY.start, balance::UNEVEN),
             (CORNER.start, balance::CORNER),
         ];
         let ranges =
@@ -327,10 +329,7 @@ impl Spring {
         if !self.is_linear() {
             place(&mut frame.left, &self.torque(projection), -1.0);
         }
-        for (k, unknown) in ASYMMETRY.enumerate() {
-            let even = projection.of(|phi| self.uneven(phi)[k].0);
-            place(&mut frame.directions[unknown], &even, 1.0);
-        }
+        place(&mut frame.directions[ASYMMETRY.end - 1], &projection.of(|phi| phi * phi), 1.0);
         let slope = self.slope(projection);
         let moved = projection.of(|phi| self.law.at(phi + self.zero, alpha).1);
         place(&mut frame.directions[ZERO], &moved, 1.0);
@@ -351,12 +350,6 @@ impl Spring {
     fn curve(&self, phi: f64) -> (f64, f64) {
         let (torque, stiffness) = self.law.at(phi + self.zero, self.parameters());
         (torque + self.corner * phi * phi.abs(), stiffness + 2.0 * self.corner * phi.abs())
-    }
-
-    /// |φ| and φ² from the zero on, and their slopes.
-    fn uneven(&self, phi: f64) -> [(f64, f64); 2] {
-        let phi = phi + self.zero;
-        [(phi.abs(), phi.signum()), (phi * phi, 2.0 * phi)]
     }
 
     /// τ_e as a sum of the family's functions.

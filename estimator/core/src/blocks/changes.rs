@@ -6,7 +6,7 @@ use crate::causes::{Cause, Known, Noise, Odds, TABLE};
 use crate::choices::{BLOCKS, CONVINCING, EVEN, FEWEST, REST, UNUSUAL};
 use crate::gram::{Gram, Set, UNKNOWNS, inverse, set};
 use crate::spring::TERMS;
-use crate::unknowns::{CORNER, DAMPING, INERTIA, SPRING, ZERO};
+use crate::unknowns::{ASYMMETRY, CORNER, DAMPING, INERTIA, SPRING, ZERO};
 
 impl Blocks {
     /// Something has changed: rows are of use again when the filters have forgotten what was before.
@@ -142,7 +142,7 @@ impl Blocks {
 
     pub(super) fn carry_over(&mut self, opens: Set) {
         let Some(posterior) = &self.posterior else { return };
-        let kept = posterior.set & !opens & !set(CORNER); // it is of one size
+        let kept = posterior.set & !opens & !set(CORNER.start..ASYMMETRY.end); // they are of one size
         let mut x = posterior.x;
         for (i, unknown) in SPRING.enumerate() {
             x[unknown] = self.spring.alpha[i];

@@ -45,7 +45,10 @@ impl Spring {
             by_torque[CORNER.start] = now * now.abs() / square;
             by_stiffness[CORNER.start] = 2.0 * now.abs() / square;
         }
-        for (unknown, (more, stiffer)) in ASYMMETRY.zip(self.uneven(now)) {
+        let size = balance.size.deflection;
+        let uneven = [(now.abs() / size, now.signum() / size), (now * now, 2.0 * now)];
+        for (unknown, (more, stiffer)) in ASYMMETRY.zip(uneven).filter(|(unknown, _)| set >> unknown & 1 == 1)
+        {
             (by_torque[unknown], by_stiffness[unknown]) = (more, stiffer);
             torque += x[unknown] * more;
             stiffness += x[unknown] * stiffer;

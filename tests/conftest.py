@@ -51,7 +51,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     # A tenth of the time would go into looking through hundreds of modules for garbage, again and again: `swept`.
     gc.collect()
     gc.freeze()
-    gc.set_threshold(50_000)
+    gc.set_threshold(10_000)
     for item in items:
         if item.path.stem in REAL_TIME:
             item.add_marker(pytest.mark.real_time)

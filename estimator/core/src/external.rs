@@ -22,7 +22,7 @@ pub use paper::PaperMomentum;
 
 use serde::{Deserialize, Serialize};
 
-use crate::choices::{BLOCK_S, BLOCKS, LATEST, LINK_FLOOR, MEAN_S, SETTLED, SLOW_S};
+use crate::choices::{BLOCK_S, BLOCKS, LATEST, LINK_FLOOR, SETTLED, SLOW_S};
 use crate::effects::{Coordinates, Element};
 use crate::filters::StateVariableFilter;
 use crate::model::{Link, Model};
@@ -86,8 +86,12 @@ impl External {
 pub struct Carried {
     /// τ_e,t, with what else the transmissions transmit, N·m.
     pub torque: f64,
-    /// Its variance, (N·m)², as the curve is uncertain; a skew between the encoders is not in it.
+    /// Its variance, (N·m)², as the curve is uncertain; a skew between the encoders is not in it …
     pub variance: f64,
+    /// … but here: what the torque lacks by it over the link's velocity, N·m·s/rad …
+    pub skew: f64,
+    /// … and its variance.
+    pub skew_variance: f64,
     /// σ_t, N·m/rad.
     pub stiffness: f64,
     /// Variance that the motors' encoders give it, (N·m)².
@@ -101,6 +105,8 @@ impl Carried {
         Carried {
             torque: self.torque + other.torque,
             variance: self.variance + other.variance,
+            skew: self.skew + other.skew,
+            skew_variance: self.skew_variance + other.skew_variance,
             stiffness: self.stiffness + other.stiffness,
             reading: self.reading + other.reading,
         }
@@ -166,7 +172,6 @@ pub struct LinkMomentum {
     shifted: [f64; 3], // what a late sample is off by in q …
     pulled: [f64; 3],  // … and in g + τ_e
     last: [f64; 6],    // of these channels, in this order
-    skew: f64,         // between the encoders, before any data, s
     dry: f64,          // undeclared dry friction, as a share of the torque carried
     errors: LinkErrors,
     judge: Judge,
@@ -208,7 +213,6 @@ impl LinkMomentum {
             last: [0.0; 6],
             judge: Judge::new(settings, filter.bandwidth, period_s),
             filter,
-            skew: priors.encoder_delay * period_s,
             dry: priors.coulomb_friction,
             errors: LinkErrors::default(),
             trailing: 0.0,
@@ -288,8 +292,8 @@ impl LinkMomentum {
         let expected = curve + readings;
         let doubt = self.errors.doubt(left, expected, self.period);
         if self.errors.is_usual(left, expected) {
-            // Errors of readings last as long as the filter does, what the model leaves as long as a motion.
-            let lasting = (readings / self.filter.bandwidth).max(self.errors.left() * MEAN_S);
+            // Errors of readings last as long as the filter does.
+            let lasting = (readings / self.filter.bandwidth).max(self.errors.lasting());
             self.errors.identify(row, left, doubt * lasting / self.period);
         }
     }
@@ -312,7 +316,7 @@ impl LinkMomentum {
         let own = link.inertia * acceleration + link.damping * velocity + self.gravity[0];
         let own = own + self.effects.iter().map(|element| element.torque(&c)).sum::<f64>();
         let sum = own + self.carried[0];
-        let damping = link.damping_std.powi(2) + (carried.stiffness * self.skew).powi(2);
+        let damping = link.damping_std.powi(2) + carried.skew_variance;
         // From another phase, gravity is off by up to twice its amplitude.
         let anywhere = if self.moved { 2.0 * link.gravity } else { 0.0 };
         let (dry, gravity) = (self.dry * self.judge.largest, link.gravity_std.powi(2) + anywhere * anywhere);
@@ -320,7 +324,7 @@ impl LinkMomentum {
         let row = self.errors.row(link, self.position);
         self.errors.forget(row[DRY], self.period);
         let row = std::array::from_fn(|i| if prior[i] > 0.0 { row[i] } else { 0.0 }); // 0: known exactly
-        let (off, unknown) = self.errors.at(&row, &prior);
+        let (off, unknown) = self.errors.at(&row, &prior, -carried.skew);
         // A reading that is rounded errs alike for as long as it stands: what the spring makes of it is no noise.
         let read = carried.reading + carried.stiffness.powi(2) * noise;
         let white = noise * (link.inertia.powi(2) * self.gains[2] + link.damping.powi(2) * self.gains[1]);

@@ -15,6 +15,15 @@ impl Blocks {
             .then(|| (known.x[LATE], known.covariance[LATE][LATE].sqrt()))
     }
 
+    /// By how much the link's position is later than the motor's, s, as far as it is known, and its variance.
+    #[must_use]
+    pub fn lateness(&self) -> (f64, f64) {
+        match &self.posterior {
+            Some(known) if known.set >> LATE & 1 == 1 => (known.x[LATE], known.covariance[LATE][LATE]),
+            _ => (0.0, (self.priors.encoder_delay * self.period).powi(2)),
+        }
+    }
+
     /// Torque and stiffness at a deflection, with their slopes by the unknowns; `None`: nothing is known.
     #[must_use]
     pub fn at(&self, phi: f64, link_rate: f64, balance: &Balance) -> Option<Reading> {

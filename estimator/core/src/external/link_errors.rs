@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{MEMORY_S, TINY};
-use crate::choices::{MEAN_S, ONE_WAY, SLOW, SLOW_S, SURE};
+use crate::choices::{MEAN_S, NOISE_S, ONE_WAY, SLOW, SLOW_S, SURE};
 use crate::model::Link;
 
 const PARAMETERS: usize = 6;
@@ -32,7 +32,8 @@ pub(super) struct LinkErrors {
     learned_s: f64,
     direction: f64,    // its mean over the memory: ±1 one way only, 0 to and fro
     whole: [f64; 2],   // what all parameters make of the last row, the constant too, and its variance
-    left: Option<f64>, // mean square of what they leave of late, (N·m)², pushes apart …
+    slow: f64,         // mean of what they leave of late, N·m, pushes apart …
+    left: Option<f64>, // … its mean square …
     unexplained: f64,  // … and the share of the time for which that is not what is expected
 }
 
@@ -60,16 +61,18 @@ impl LinkErrors {
         self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
     }
 
-    /// The torque that these errors make, and its variance: as identified, and as before any data.
+    /// The torque that these errors make, and its variance: as identified, and as before any data; `damping`: its error then.
     ///
     /// Torques of a hand that guides the link are as smooth as errors of the link. What was identified is believed where
     /// it explains the balance for more than half of the time; pushes are shorter.
-    pub(super) fn at(&mut self, row: &Row, prior: &Row) -> (f64, f64) {
-        let (torque, variance) = self.identified(row, prior);
+    pub(super) fn at(&mut self, row: &Row, prior: &Row, damping: f64) -> (f64, f64) {
+        let (torque, variance) = self.identified(row, prior, damping);
+        let expected = row[DAMPING] * damping;
         let before: f64 = (CONSTANT + 1..PARAMETERS).map(|i| row[i] * row[i] * prior[i]).sum();
         let believed = (2.0 * (1.0 - self.unexplained)).min(1.0);
-        let between = believed * (1.0 - believed) * torque * torque;
-        (believed * torque, believed * variance + (1.0 - believed) * before + between)
+        let between = believed * (1.0 - believed) * (torque - expected).powi(2);
+        let mean = expected + believed * (torque - expected);
+        (mean, believed * variance + (1.0 - believed) * before + between)
     }
 
     /// Whether errors of the link, or a load that stays, may leave so much; `expected`: variance of the rest.
@@ -93,14 +96,16 @@ impl LinkErrors {
     ///
     /// A load that has come to stay is another constant: once half of the time was not as expected, it may be any.
     pub(super) fn doubt(&mut self, left: f64, expected: f64, period_s: f64) -> f64 {
-        let before = self.left.unwrap_or(expected);
+        // What is expected counts as one motion.
+        let before = self.left.unwrap_or(expected * MEAN_S / (2.0 * NOISE_S));
         if self.left.is_none() {
-            self.learned_s = MEAN_S; // what is expected counts as one motion
+            self.learned_s = MEAN_S;
         }
         let gain = lately(&mut self.learned_s, period_s, SLOW_S);
-        let square = (left - self.whole[0]).powi(2);
-        let doubt = 1.0 + square / expected.max(TINY * TINY);
-        self.left = Some(before + gain * (square / doubt - before));
+        let left = left - self.whole[0];
+        let doubt = 1.0 + left * left / expected.max(TINY * TINY);
+        self.slow += period_s / NOISE_S * (left / doubt.sqrt() - self.slow);
+        self.left = Some(before + gain * (self.slow * self.slow - before));
         let before = self.unexplained;
         self.unexplained += gain * (1.0 - doubt.recip() - before);
         if before <= 0.5 && self.unexplained > 0.5 {
@@ -109,7 +114,7 @@ impl LinkErrors {
         doubt
     }
 
-    fn identified(&mut self, row: &Row, prior: &Row) -> (f64, f64) {
+    fn identified(&mut self, row: &Row, prior: &Row, damping: f64) -> (f64, f64) {
         let mut factor = self.information;
         let least = prior.map(|variance| if variance > 0.0 { 1.0 / variance } else { 1.0 });
         for i in 0..PARAMETERS {
@@ -119,6 +124,7 @@ impl LinkErrors {
         let mut own = *row;
         own[CONSTANT] = 0.0;
         let mut vector = self.vector;
+        vector[DAMPING] += damping * least[DAMPING];
         let (mut torque, mut variance, mut level) = (0.0, 0.0, [0.0; PARAMETERS]);
         level[CONSTANT] = row[CONSTANT];
         self.whole = [0.0; 2];
@@ -145,9 +151,9 @@ impl LinkErrors {
         (torque, variance)
     }
 
-    /// Mean square of what these errors leave of late, (N·m)².
-    pub(super) fn left(&self) -> f64 {
-        self.left.unwrap_or(0.0)
+    /// Spectral density at rest of what these errors leave of late, (N·m)² s: of its mean over [`NOISE_S`].
+    pub(super) fn lasting(&self) -> f64 {
+        2.0 * NOISE_S * self.left.unwrap_or(0.0)
     }
 
     /// What the declared link leaves of one balance; `noise`: its variance, as if errors were independent.
@@ -194,11 +200,11 @@ mod tests {
             errors.forget(speed.signum(), 1e-6);
             errors.identify(&row, left, 1e-4);
         }
-        let (torque, variance) = errors.at(&row, &prior);
+        let (torque, variance) = errors.at(&row, &prior, 0.0);
         let expected: f64 = row.iter().zip(truth).skip(1).map(|(x, p)| x * p).sum();
         assert!((torque - expected).abs() < 1e-4, "{torque} is not {expected}");
         assert!(variance > 0.0 && variance < 1e-4);
         // What is declared without doubt stays.
-        assert!(LinkErrors::default().at(&row, &prior).0 == 0.0);
+        assert!(LinkErrors::default().at(&row, &prior, 0.0).0 == 0.0);
     }
 }

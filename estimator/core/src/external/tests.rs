@@ -40,7 +40,9 @@ fn a_load_on_a_link_that_turns_one_way_is_not_taken_for_its_friction() {
     momentum.reset();
     let (load, speed) = (-1.9, 40.0);
     momentum.restart(0.0, load);
-    let carried = Carried { torque: load, stiffness: 35.0, ..Carried::default() };
+    let stiffness: f64 = 35.0;
+    let skew_variance = (stiffness * T).powi(2);
+    let carried = Carried { torque: load, stiffness, skew_variance, ..Carried::default() };
     let mut external = External::nothing(0);
     for k in 1..20_000_u64 {
         momentum.feed(speed * k as f64 * T, Some(load), f64::NAN, 0.0);

@@ -1,5 +1,6 @@
 """Encoders from 12 to 26 bits, or that count from elsewhere: valid where the motion shows the stiffness, never wrong."""
 
+import itertools
 import math
 
 import numpy as np
@@ -73,6 +74,31 @@ def test_a_joint_that_turns_all_the_time_is_valid():
     # At 38 rad/s what is unknown of the link's delay makes the torque, not the stiffness, uncertain.
     sure = found.std_nm_rad < 0.2 * found.stiffness_nm_rad
     assert np.mean(sure[SETTLED:]) > 0.95
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_rounding_at_rest_is_no_effect(seed):
+    """Moves of 2 s with rests of 1 s: both encoders stand, so their rounding is alike for a second and no noise."""
+    period, stiffness, fine = 0.002, 500.0, 4  # the torque is held: its mean over a period
+    share = np.minimum(np.arange(0.0, 3.0, period / fine) / 2.0, 1.0)
+    way = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-1.0, 1.0, 16)
+    q = np.concatenate([a + (b - a) * way for a, b in itertools.pairwise(places)])
+    rate, bend = (lambda x: np.gradient(x, period / fine)), lambda x: rate(rate(x))
+    theta = q + (0.3 * bend(q) + 6.0 * np.sin(q)) / stiffness
+    torque = 0.03 * bend(theta) + 0.25 * rate(theta) + stiffness * (theta - q)
+    held = torque.reshape(-1, fine).mean(axis=1) + 0.02 * rng.normal(size=len(q) // fine)
+    count = 2.0 * math.pi / 2**17
+    read = np.round(np.stack((theta, q))[:, ::fine] / count) * count
+    spring = kit.Transmission(model="linear", parameters={"k_nm_rad": stiffness})
+    motor = kit.Motor(inertia_kg_m2=0.03, viscous_damping_nm_s_rad=0.25, transmission=spring)
+    joint = kit.JointModel(arrangement="single", motors=(motor,))
+    estimator = kit.make_estimator(joint, kit.EstimatorSettings(), period)
+    for k, (a, b, tau) in enumerate(np.stack((*read, held)).T.tolist()):
+        estimate = estimator.step(kit.Sample(k, (a,), (math.nan,), (tau,), b))
+        if k * period > 8.0:  # few blocks may show an effect for a moment
+            assert estimator.undeclared() == [[]] and estimate.status & kit.VALID, k * period
 
 
 def rebooted(motion, name, off, doubted=-1):

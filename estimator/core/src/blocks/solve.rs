@@ -278,7 +278,10 @@ impl Blocks {
         let (base, mut groups) = self.groups(frame);
         let many = self.ring.len() >= FEWEST;
         if !many {
-            groups[..CANDIDATES.len()].fill(0); // few rows show noise as effects
+            // Few rows show noise as effects; powers are one of a line.
+            let straight = matches!(self.spring.law, Law::Linear);
+            let effects = if straight { groups.len() } else { CANDIDATES.len() };
+            groups[..effects].fill(0);
         }
         let found = choose(reduced, base, &groups, self.spring.shape(), prior, noise);
         if many && !self.lost && frame.set >> ZERO & 1 == 1 {
@@ -289,7 +292,7 @@ impl Blocks {
             let other = choose(reduced, base, &groups, self.spring.shape(), &elsewhere, noise);
             if log_evidence(reduced, other, &elsewhere, noise) > log + (groups.len() as f64).ln() {
                 let found = solve(reduced, other, &elsewhere, noise)?;
-                if self.is_seen(self.spring.zero + found.x[ZERO]) {
+                if self.is_seen(&found) {
                     return Some((found, true));
                 }
             }
@@ -297,11 +300,14 @@ impl Blocks {
         solve(reduced, found, prior, noise).map(|found| (found, false))
     }
 
-    /// Whether a zero that has moved by so much can be told from another curve: one whose law is open only where
-    /// deflections reach as far beyond it to either side.
-    fn is_seen(&self, moved: f64) -> bool {
+    /// Whether a zero that has moved can be told from another curve: one whose law is open only where deflections reach as
+    /// far beyond it to either side. That of a straight line is a constant torque.
+    fn is_seen(&self, found: &Posterior) -> bool {
         let ([low, high], spring) = (self.seen, &self.spring);
-        let open = spring.law.is_polynomial() && !spring.is_anchored();
+        let moved = spring.zero + found.x[ZERO];
+        let straight =
+            matches!(spring.law, Law::Linear) && spring.is_constant() && !spring.is_longer(found.set);
+        let open = spring.law.is_polynomial() && !spring.is_anchored() && !straight;
         !open || 2.0 * moved.abs() < high.min(-low)
     }
 }

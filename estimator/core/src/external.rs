@@ -347,7 +347,7 @@ impl LinkMomentum {
             torque,
             torque_std: (around + white + moved * moved).sqrt(),
             link_torque: self.measured[0] - own,
-            difference: sum - self.measured[0],
+            difference: sum + carried.skew * velocity - self.measured[0],
         };
         self.latest.publish(external, self.period)
     }

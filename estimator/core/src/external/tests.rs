@@ -83,6 +83,24 @@ fn a_load_that_stays_is_not_taken_off_and_hides_no_error_of_the_link() {
 }
 
 #[test]
+fn a_skew_that_the_motors_balance_has_found_is_neither_external_nor_a_difference() {
+    // A free link at 3 rad/s, read a period late: its spring seems to carry −σ T q′.
+    let mut momentum = LinkMomentum::new(&joint(FREE), &Settings::default(), &Priors::USUAL, T).unwrap();
+    momentum.reset();
+    let (speed, stiffness) = (3.0, 500.0);
+    let skew = stiffness * T;
+    let carried = Carried { stiffness, skew, skew_variance: (0.1 * skew).powi(2), ..Carried::default() };
+    let mut external = External::nothing(0);
+    for k in 0..400_u64 {
+        momentum.feed(speed * k as f64 * T, Some(-skew * speed), f64::NAN, 0.0);
+        external = momentum.conclude(k, &carried, 1e-14, k > 200);
+    }
+    assert!(external.status & status::VALID != 0);
+    let torques = [external.torque, external.difference];
+    assert!(torques.iter().all(|torque| torque.abs() < 1e-3 * skew * speed), "{torques:?}");
+}
+
+#[test]
 fn a_push_on_a_free_link_rises_as_its_filter_does() {
     // q = ½ (τ/M) t² with τ_e = 0: the residual is w³/(s + w)³ of the push.
     let settings = Settings { contact_torque: Some(0.1), ..Settings::default() };

@@ -320,11 +320,11 @@ impl LinkMomentum {
         // From another phase, gravity is off by up to twice its amplitude.
         let anywhere = if self.moved { 2.0 * link.gravity } else { 0.0 };
         let (dry, gravity) = (self.dry * self.judge.largest, link.gravity_std.powi(2) + anywhere * anywhere);
-        let prior = [f64::INFINITY, link.inertia_std.powi(2), damping, dry * dry, gravity, gravity];
+        let prior = [f64::INFINITY, link.inertia_std.powi(2), damping, gravity, gravity, dry * dry];
         let row = self.errors.row(link, self.position);
         self.errors.forget(row[DRY], self.period);
         let row = std::array::from_fn(|i| if prior[i] > 0.0 { row[i] } else { 0.0 }); // 0: known exactly
-        let (off, unknown) = self.errors.at(&row, &prior, -carried.skew);
+        let (off, unknown) = self.errors.at(&row, &prior, -carried.skew, self.effects.is_empty());
         // A reading that is rounded errs alike for as long as it stands: what the spring makes of it is no noise.
         let read = carried.reading + carried.stiffness.powi(2) * noise;
         let white = noise * (link.inertia.powi(2) * self.gains[2] + link.damping.powi(2) * self.gains[1]);

@@ -9,11 +9,11 @@ use crate::model::Link;
 const PARAMETERS: usize = 6;
 const CONSTANT: usize = 0;
 const DAMPING: usize = 2;
-pub(super) const DRY: usize = 3;
+pub(super) const DRY: usize = PARAMETERS - 1;
 
 /// How far the declared link is off: identified from the link's own balance, where that is as expected.
 ///
-/// Parameters: a constant torque, inertia, viscous damping, dry friction, gravity's sine and cosine. The
+/// Parameters: a constant torque, inertia, viscous damping, gravity's sine and cosine, dry friction. The
 /// declared uncertainties are the priors. Recursive least squares with exponential forgetting in information
 /// form, Λ = Λ₀ + Σ e^(−t/25 s) x xᵀ/r, each balance with the weight of Student's distribution: what is left of a push
 /// has little.
@@ -32,9 +32,10 @@ pub(super) struct LinkErrors {
     learned_s: f64,
     direction: f64,    // its mean over the memory: ±1 one way only, 0 to and fro
     whole: [f64; 2],   // what all parameters make of the last row, the constant too, and its variance
-    slow: f64,         // mean of what they leave of late, N·m, pushes apart …
+    load: f64,         // mean of what they leave of late, N·m …
+    slow: f64,         // … and pushes apart …
     left: Option<f64>, // … its mean square …
-    unexplained: f64,  // … and the share of the time for which that is not what is expected
+    unexplained: f64,  // … and the share of the time for which what varies is not what is expected
 }
 
 /// Gain of a mean over so many seconds, or over all that have passed.
@@ -51,7 +52,7 @@ impl LinkErrors {
         self.fastest = self.fastest.max(velocity.abs());
         let dry = (velocity / (SLOW * self.fastest).max(TINY)).tanh();
         let (sine, cosine) = (q + link.gravity_phase).sin_cos();
-        [1.0, acceleration, velocity, dry, sine, cosine]
+        [1.0, acceleration, velocity, sine, cosine, dry]
     }
 
     /// One period of motion in this direction (−1 to 1) passes.
@@ -61,12 +62,13 @@ impl LinkErrors {
         self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
     }
 
-    /// The torque that these errors make, and its variance: as identified, and as before any data; `damping`: its error then.
+    /// The torque that these errors make, and its variance: as identified, and as before any data; `damping`: its error then;
+    /// `brakes`: whether no friction is declared.
     ///
     /// Torques of a hand that guides the link are as smooth as errors of the link. What was identified is believed where
     /// it explains the balance for more than half of the time; pushes are shorter.
-    pub(super) fn at(&mut self, row: &Row, prior: &Row, damping: f64) -> (f64, f64) {
-        let (torque, variance) = self.identified(row, prior, damping);
+    pub(super) fn at(&mut self, row: &Row, prior: &Row, damping: f64, brakes: bool) -> (f64, f64) {
+        let (torque, variance) = self.identified(row, prior, damping, brakes);
         let expected = row[DAMPING] * damping;
         let before: f64 = (CONSTANT + 1..PARAMETERS).map(|i| row[i] * row[i] * prior[i]).sum();
         let believed = (2.0 * (1.0 - self.unexplained)).min(1.0);
@@ -81,20 +83,9 @@ impl LinkErrors {
         (left - torque).abs() <= SURE * (variance + expected).sqrt()
     }
 
-    /// Forget the constant, and keep what it has taught of the others (Schur's complement).
-    fn open_constant(&mut self) {
-        let of = self.information.map(|row| row[CONSTANT]);
-        let known = of[CONSTANT].max(TINY * TINY);
-        let torque = self.vector[CONSTANT];
-        for i in 0..PARAMETERS {
-            self.vector[i] -= of[i] / known * torque;
-            (0..=i).for_each(|j| self.information[i][j] -= of[i] / known * of[j]);
-        }
-    }
-
     /// How much noisier a balance seems than expected, 1 or more, by what is left of it; `expected`: its variance.
     ///
-    /// A load that has come to stay is another constant: once half of the time was not as expected, it may be any.
+    /// A load that has come to stay is no error of the link, and no doubt about what was identified: only what varies is.
     pub(super) fn doubt(&mut self, left: f64, expected: f64, period_s: f64) -> f64 {
         // What is expected counts as one motion.
         let before = self.left.unwrap_or(expected * MEAN_S / (2.0 * NOISE_S));
@@ -103,18 +94,16 @@ impl LinkErrors {
         }
         let gain = lately(&mut self.learned_s, period_s, SLOW_S);
         let left = left - self.whole[0];
-        let doubt = 1.0 + left * left / expected.max(TINY * TINY);
+        let doubt_of = |left: f64| 1.0 + left * left / expected.max(TINY * TINY);
+        let doubt = doubt_of(left);
         self.slow += period_s / NOISE_S * (left / doubt.sqrt() - self.slow);
         self.left = Some(before + gain * (self.slow * self.slow - before));
-        let before = self.unexplained;
-        self.unexplained += gain * (1.0 - doubt.recip() - before);
-        if before <= 0.5 && self.unexplained > 0.5 {
-            self.open_constant();
-        }
+        self.load += period_s / NOISE_S * (left - self.load);
+        self.unexplained += gain * (1.0 - doubt_of(left - self.load).recip() - self.unexplained);
         doubt
     }
 
-    fn identified(&mut self, row: &Row, prior: &Row, damping: f64) -> (f64, f64) {
+    fn identified(&mut self, row: &Row, prior: &Row, damping: f64, brakes: bool) -> (f64, f64) {
         let mut factor = self.information;
         let least = prior.map(|variance| if variance > 0.0 { 1.0 / variance } else { 1.0 });
         for i in 0..PARAMETERS {
@@ -143,6 +132,10 @@ impl LinkErrors {
             own[i] /= factor[i][i];
             level[i] /= factor[i][i];
             vector[i] /= factor[i][i];
+            // Friction that nobody declared brakes: what pushes the link on is a hand.
+            if i == DRY && brakes && vector[i] > 0.0 {
+                break;
+            }
             torque += own[i] * vector[i];
             let all = own[i] + level[i];
             self.whole = [self.whole[0] + all * vector[i], self.whole[1] + all * all];
@@ -187,7 +180,7 @@ mod tests {
             damping_std: 0.02,
             gravity_std: 0.6,
         };
-        let truth: Row = [0.7, 0.03, -0.05, 0.2, 0.5, -0.1];
+        let truth: Row = [0.7, 0.03, -0.05, 0.5, -0.1, -0.2];
         let prior: Row = [1e6; PARAMETERS];
         let mut errors = LinkErrors { seen_s: MEMORY_S, ..LinkErrors::default() }; // to and fro
         let mut row = [0.0; PARAMETERS];
@@ -200,11 +193,23 @@ mod tests {
             errors.forget(speed.signum(), 1e-6);
             errors.identify(&row, left, 1e-4);
         }
-        let (torque, variance) = errors.at(&row, &prior, 0.0);
+        let (torque, variance) = errors.at(&row, &prior, 0.0, true);
         let expected: f64 = row.iter().zip(truth).skip(1).map(|(x, p)| x * p).sum();
         assert!((torque - expected).abs() < 1e-4, "{torque} is not {expected}");
         assert!(variance > 0.0 && variance < 1e-4);
+        // A torque along the motion is no friction.
+        let push: Row = std::array::from_fn(|i| if i == DRY { 0.2 } else { 0.0 });
+        let mut errors = LinkErrors { seen_s: MEMORY_S, ..LinkErrors::default() };
+        for k in 0..4000 {
+            let phase = 1e-2 * f64::from(k);
+            row = errors.row(&link, [phase.sin(), phase.cos(), -phase.sin()]);
+            errors.identify(&row, row[DRY] * push[DRY], 1e-4);
+        }
+        let known: Row = std::array::from_fn(|i| if i == DRY { 1e6 } else { 0.0 });
+        let only: Row = std::array::from_fn(|i| if i == DRY { row[i] } else { 0.0 });
+        assert!(errors.at(&only, &known, 0.0, true).0 == 0.0);
+        assert!((errors.at(&only, &known, 0.0, false).0 - row[DRY] * push[DRY]).abs() < 0.02);
         // What is declared without doubt stays.
-        assert!(LinkErrors::default().at(&row, &prior, 0.0).0 == 0.0);
+        assert!(LinkErrors::default().at(&row, &prior, 0.0, true).0 == 0.0);
     }
 }

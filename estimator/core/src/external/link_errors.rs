@@ -99,7 +99,8 @@ impl LinkErrors {
         self.slow += period_s / NOISE_S * (left / doubt.sqrt() - self.slow);
         self.left = Some(before + gain * (self.slow * self.slow - before));
         self.load += period_s / NOISE_S * (left - self.load);
-        self.unexplained += gain * (1.0 - doubt_of(left - self.load).recip() - self.unexplained);
+        let varying = doubt.min(doubt_of(left - self.load));
+        self.unexplained += gain * (1.0 - varying.recip() - self.unexplained);
         doubt
     }
 

@@ -90,8 +90,8 @@ pub struct Carried {
     pub variance: f64,
     /// … but here: what the torque lacks by it over the link's velocity, N·m·s/rad …
     pub skew: f64,
-    /// … and its variance.
-    pub skew_variance: f64,
+    /// … and its standard deviation; a late link is late for both motors.
+    pub skew_std: f64,
     /// σ_t, N·m/rad.
     pub stiffness: f64,
     /// Variance that the motors' encoders give it, (N·m)².
@@ -99,14 +99,14 @@ pub struct Carried {
 }
 
 impl Carried {
-    /// Both pull at the link (eqs 9, 11); their errors are independent.
+    /// Both pull at the link (eqs 9, 11); their errors are independent but for the skew.
     #[must_use]
     pub fn and(self, other: Carried) -> Carried {
         Carried {
             torque: self.torque + other.torque,
             variance: self.variance + other.variance,
             skew: self.skew + other.skew,
-            skew_variance: self.skew_variance + other.skew_variance,
+            skew_std: self.skew_std + other.skew_std,
             stiffness: self.stiffness + other.stiffness,
             reading: self.reading + other.reading,
         }
@@ -316,7 +316,7 @@ impl LinkMomentum {
         let own = link.inertia * acceleration + link.damping * velocity + self.gravity[0];
         let own = own + self.effects.iter().map(|element| element.torque(&c)).sum::<f64>();
         let sum = own + self.carried[0];
-        let damping = link.damping_std.powi(2) + carried.skew_variance;
+        let damping = link.damping_std.powi(2) + carried.skew_std.powi(2);
         // From another phase, gravity is off by up to twice its amplitude.
         let anywhere = if self.moved { 2.0 * link.gravity } else { 0.0 };
         let (dry, gravity) = (self.dry * self.judge.largest, link.gravity_std.powi(2) + anywhere * anywhere);

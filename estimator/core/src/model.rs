@@ -145,12 +145,20 @@ impl Model {
 }
 
 #[cfg(test)]
+impl Motor {
+    /// One without effects, of which nothing more is declared.
+    pub fn bare(inertia: f64, damping: f64, transmission: Transmission) -> Motor {
+        let (inertia_std, damping_std, fit_rms) = (None, None, None);
+        Motor { inertia, inertia_std, damping, damping_std, fit_rms, transmission, effects: vec![] }
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
 
     fn motor(transmission: Transmission) -> Motor {
-        let (inertia_std, damping_std, fit_rms) = (None, None, None);
-        Motor { inertia: 0.1, inertia_std, damping: 0.0, damping_std, fit_rms, transmission, effects: vec![] }
+        Motor::bare(0.1, 0.0, transmission)
     }
 
     fn elastic(law: Law, parameters: &[f64], covariance: Option<Vec<f64>>) -> Transmission {

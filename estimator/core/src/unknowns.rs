@@ -205,6 +205,12 @@ impl Spring {
         self.law.is_polynomial() && self.alpha[1..].iter().all(|power| *power == 0.0)
     }
 
+    /// Whether it is declared as a straight line: more powers are then an effect.
+    #[must_use]
+    pub fn is_line(&self) -> bool {
+        matches!(self.law, Law::Linear)
+    }
+
     /// Whether one solution is final: the balance is linear in its parameters, and its zero is where it was.
     #[must_use]
     pub fn is_settled(&self) -> bool {

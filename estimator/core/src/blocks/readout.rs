@@ -15,13 +15,10 @@ impl Blocks {
             .then(|| (known.x[LATE], known.covariance[LATE][LATE].sqrt()))
     }
 
-    /// By how much the link's position is later than the motor's, s, as far as it is known, and its variance.
+    /// The same, and what is believed before any data where it is not told from other effects.
     #[must_use]
     pub fn lateness(&self) -> (f64, f64) {
-        match &self.posterior {
-            Some(known) if known.set >> LATE & 1 == 1 => (known.x[LATE], known.covariance[LATE][LATE]),
-            _ => (0.0, (self.priors.encoder_delay * self.period).powi(2)),
-        }
+        self.delay().unwrap_or((0.0, self.priors.encoder_delay * self.period))
     }
 
     /// Torque and stiffness at a deflection, with their slopes by the unknowns; `None`: nothing is known.

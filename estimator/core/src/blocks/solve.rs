@@ -279,8 +279,7 @@ impl Blocks {
         let many = self.ring.len() >= FEWEST;
         if !many {
             // Few rows show noise as effects; powers are one of a line.
-            let straight = matches!(self.spring.law, Law::Linear);
-            let effects = if straight { groups.len() } else { CANDIDATES.len() };
+            let effects = if self.spring.is_line() { groups.len() } else { CANDIDATES.len() };
             groups[..effects].fill(0);
         }
         let found = choose(reduced, base, &groups, self.spring.shape(), prior, noise);
@@ -305,8 +304,7 @@ impl Blocks {
     fn is_seen(&self, found: &Posterior) -> bool {
         let ([low, high], spring) = (self.seen, &self.spring);
         let moved = spring.zero + found.x[ZERO];
-        let straight =
-            matches!(spring.law, Law::Linear) && spring.is_constant() && !spring.is_longer(found.set);
+        let straight = spring.is_line() && !spring.is_longer(found.set);
         let open = spring.law.is_polynomial() && !spring.is_anchored() && !straight;
         !open || 2.0 * moved.abs() < high.min(-low)
     }
@@ -326,15 +324,7 @@ mod tests {
             parameters: vec![0.5, 1.75],
             covariance: None,
         };
-        let motor = Motor {
-            inertia: 5e-4,
-            inertia_std: None,
-            damping: 5e-3,
-            damping_std: None,
-            fit_rms: None,
-            transmission,
-            effects: Vec::new(),
-        };
+        let motor = Motor::bare(5e-4, 5e-3, transmission);
         let [low, high] = [-0.6, 0.15]; // it ends at 1.2 rad
         for size in [1.8, 1.05] {
             let mut blocks = Blocks::new(&motor, &Priors::USUAL, 1e-3, 100.0, 75, 1.0);

@@ -7,15 +7,7 @@ use crate::sample::{MOTORS, Sample};
 const T: f64 = 1e-3;
 
 fn joint(link: Link) -> Model {
-    let motor = Motor {
-        inertia: 0.1,
-        inertia_std: None,
-        damping: 0.2,
-        damping_std: None,
-        fit_rms: None,
-        transmission: Transmission::Unknown,
-        effects: Vec::new(),
-    };
+    let motor = Motor::bare(0.1, 0.2, Transmission::Unknown);
     Model {
         arrangement: Arrangement::Single,
         motors: vec![motor],
@@ -41,8 +33,7 @@ fn a_load_on_a_link_that_turns_one_way_is_not_taken_for_its_friction() {
     let (load, speed) = (-1.9, 40.0);
     momentum.restart(0.0, load);
     let stiffness: f64 = 35.0;
-    let skew_variance = (stiffness * T).powi(2);
-    let carried = Carried { torque: load, stiffness, skew_variance, ..Carried::default() };
+    let carried = Carried { torque: load, stiffness, skew_std: stiffness * T, ..Carried::default() };
     let mut external = External::nothing(0);
     for k in 1..20_000_u64 {
         momentum.feed(speed * k as f64 * T, Some(load), f64::NAN, 0.0);
@@ -89,7 +80,7 @@ fn a_skew_that_the_motors_balance_has_found_is_neither_external_nor_a_difference
     momentum.reset();
     let (speed, stiffness) = (3.0, 500.0);
     let skew = stiffness * T;
-    let carried = Carried { stiffness, skew, skew_variance: (0.1 * skew).powi(2), ..Carried::default() };
+    let carried = Carried { stiffness, skew, skew_std: 0.1 * skew, ..Carried::default() };
     let mut external = External::nothing(0);
     for k in 0..400_u64 {
         momentum.feed(speed * k as f64 * T, Some(-skew * speed), f64::NAN, 0.0);

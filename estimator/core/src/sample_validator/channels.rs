@@ -121,15 +121,7 @@ mod tests {
 
     #[test]
     fn digits_of_a_text_and_single_precision_are_no_counts() {
-        let motor = Motor {
-            inertia: 0.1,
-            inertia_std: None,
-            damping: 0.2,
-            damping_std: None,
-            fit_rms: None,
-            transmission: Transmission::Unknown,
-            effects: Vec::new(),
-        };
+        let motor = Motor::bare(0.1, 0.2, Transmission::Unknown);
         let model = Model {
             arrangement: Arrangement::Single,
             motors: vec![motor],

@@ -114,12 +114,12 @@ impl Side {
         let at = self.blocks.at(phi, 0.0, &self.balance)?;
         let stiffness = at.stiffness + self.effects.spring(phi).1;
         let variance = self.blocks.posterior.as_ref()?.variance_along(&at.by_torque);
-        let (late, late_variance) = self.blocks.lateness();
+        let (late, late_std) = self.blocks.lateness();
         Some(Carried {
             torque: at.torque + self.transmitted,
             variance,
             skew: stiffness * late,
-            skew_variance: stiffness * stiffness * late_variance,
+            skew_std: stiffness * late_std,
             stiffness,
             reading: stiffness * stiffness * noise,
         })

@@ -54,10 +54,13 @@ impl Spring {
         }
         (mean[ZERO], std[ZERO]) = (-self.zero, zero_std);
         std[LATE] = priors.encoder_delay * period_s;
-        let mut prior = Prior::independent(mean, &std);
+        self.with_declared(Prior::independent(mean, &std))
+    }
+
+    /// With the covariance of what is declared, where it is and holds.
+    fn with_declared(&self, mut prior: Prior) -> Prior {
         if let Some(covariance) = self.covariance.filter(|_| self.anchored) {
-            let known = set(SPRING.start..SPRING.start + self.least);
-            let precision = inverse(&covariance, known);
+            let precision = inverse(&covariance, set(SPRING.start..SPRING.start + self.least));
             for i in SPRING.take(self.least) {
                 prior.precision[i] = precision[i];
             }

@@ -182,6 +182,15 @@ def test_a_stated_map_holds_until_the_node_restarts_and_one_of_its_own_for_ever(
     assert after(owned(), BOOT, (0, b"\x82\x00"), BOOT).believed == {5}
 
 
+def test_a_map_of_its_own_is_doubted_after_what_nobody_heard_until_a_restart_is_heard():
+    configurator = owned()
+    configurator.lose_sight([5], "frames were lost")
+    configurator.poll(0.0)
+    assert configurator.believed == set()
+    assert configurator.doubts[5].endswith("writes or reads back the mapping, or the node starts anew")
+    assert after(configurator, BOOT).believed == {5}
+
+
 @pytest.mark.parametrize("index", ["10", "11"])
 @pytest.mark.parametrize("command", ["23", "c2"])
 def test_after_parameters_were_stored_or_restored_a_stated_default_is_none(index, command):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 
 import pytest
@@ -153,7 +154,7 @@ def test_after_a_reset_without_a_new_map_nothing_is_valid_and_one_line_says_what
 
 def overflow(master: Master) -> None:
     master.run.loop.source.errors[OVERFLOW] = 3
-    master.run.supervisor.check()
+    master.run.supervisor._sync()
 
 
 def another_answer(master: Master) -> None:
@@ -206,6 +207,26 @@ def test_a_node_that_was_not_heard_for_a_while_may_have_restarted():
     master.nmt(START, 1)
     master.syncs(200)
     assert len(master.valid) > valid + 100 and not master.wrong
+
+
+@pytest.mark.parametrize(("silent_s", "beats", "believed"), [(0.6, 1, 0), (3.0, 0, 0), (3.0, 30, 400)])
+def test_while_nobody_is_heard_at_all_a_node_may_have_been_mapped_anew(
+    silent_s, beats, believed, monkeypatch
+):
+    """A heartbeat tells that it was not; but one may be as old as the last SYNC."""
+    master, clock, passed = mapped(), time.monotonic_ns, [0]
+    monkeypatch.setattr(time, "monotonic_ns", lambda: clock() + passed[0])
+    valid = len(master.valid)
+    for node in (1, 2, 3) * beats:
+        master.send(0x700 + node, b"\x05")
+    passed[0] = round(silent_s * 1e9)
+    master.stamp_ns += passed[0]
+    if not believed:
+        unheard = {(0x1A00, 1): TORQUE, (0x1A00, 2): STATUSWORD, (0x1A00, 3): POSITION}
+        master.run.bus.nodes[1].put(unheard)
+    master.syncs(400)
+    assert not master.wrong and len(master.valid) - valid == believed
+    assert ("no frame of it was heard for 0.5 s" in master.conditions) == (not believed)
 
 
 def test_after_a_reset_a_map_that_is_read_back_is_believed():

@@ -39,9 +39,10 @@ class _PassiveNode:
     """Mapping of one node, and whether it is trusted.
 
     A mapping is trusted if it was written or read back since the node's last start, or if the joint file
-    declares it: with `default = true` until somebody stores or restores the node's parameters, else until
-    the node restarts, or may have, out of sight. A data sheet contains the factory setting, which may have
-    changed, so it is only suggested. Another identity or date of the configuration than before ends trust.
+    declares it: until the node restarts, or may have been mapped or have restarted out of sight; with
+    `default = true` again from a restart that was heard on, until somebody stores or restores the node's
+    parameters. A data sheet contains the factory setting, which may have changed, so it is only suggested.
+    Another identity or date of the configuration than before ends trust.
     """
 
     def __init__(self, role: Role, bus: BusSection) -> None:
@@ -149,9 +150,13 @@ class _PassiveNode:
             why = f"its mapping is that of {self._sheet.path.name}, which a master may have changed"
         else:
             why = "its mapping was neither written nor read"
+        if any(section.default for section in role.tpdo):
+            way_out = "" if self.stored else ", or the node starts anew"
+        else:
+            way_out = f"; if the node has it by itself, say so in the joint file: {self.offered()}"
         return (
             f"{role.subject} ({role.key}): {why}: its frames are not used until its master writes or reads "
-            f"back the mapping; if the node has it by itself, say so in the joint file: {self.offered()}"
+            f"back the mapping{way_out}"
         )
 
     def offered(self) -> str:
@@ -205,7 +210,7 @@ class _PassiveNode:
         touched = {(index & 0x1FF) + 1 for index, _ in seen}
         stated, values = [], dict(seen)
         for section in self.role.tpdo:
-            if self.restarted and (self.stored or not section.default):
+            if self.restarted and (self.stored or self.lost or not section.default):
                 continue
             tpdo, number = _declared(section), self._number(section, seen)
             if number not in touched:

@@ -8,6 +8,7 @@ the first that the node answers with it; the daemon's own from the first after t
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from drivelink._core import SYNC_COB_ID, Assembler
@@ -142,6 +143,7 @@ class PassiveFollower(MapFollower):
         self._silent = max(2 * _LOOKS, round(_SILENT_S / configurator.bus.period_s))  # SYNCs
         self._heard = dict.fromkeys(assemblers, (0, 0))  # frames of a node, and the SYNC of the last one
         self._speaking: set[int] = set()  # since the last look, other than by PDOs
+        self._since_sync: Counter[int] = Counter()  # such frames of each node since the last SYNC
         self._numbers = {node: assembler.sequence for node, assembler in assemblers.items()}
         configurator.adopt(layout for node, layout in layouts.items() if node not in configurator.layouts)
         self._judge()
@@ -159,6 +161,7 @@ class PassiveFollower(MapFollower):
             return
         if cob_id > 0x700 or 0x580 < cob_id < 0x600:
             self._speaking.add(cob_id & 0x7F)
+            self._since_sync[cob_id & 0x7F] += 1
         self._listener.feed(cob_id, data, now_s)
         self._listener.poll(now_s)
         self._judge()
@@ -166,6 +169,7 @@ class PassiveFollower(MapFollower):
     def sync(self) -> Sequence[Mismatch]:
         """See `MapFollower.sync`."""
         self._check_silence()
+        self._since_sync.clear()
         return super().sync()
 
     def lose_sight(self, nodes: Iterable[int] | None = None, why: str = "the bus was lost") -> None:
@@ -192,14 +196,16 @@ class PassiveFollower(MapFollower):
             self._numbers[node] = number
             counters, (frames, last) = assembler.counters[node], self._heard[node]
             received = counters.received + counters.ignored
-            gap = number - before >= self._silent  # nobody was heard, SYNC included: a clock that was set
-            if gap or node in self._speaking or received != frames:
-                self._heard[node] = received, number
-            elif number - last >= max(self._silent, 3 * _slowest(self._in_use[node])):
+            if gap := number - before >= self._silent:  # no SYNC either; one frame may be as old as the last
+                heard = self._since_sync[node] > 1
+            else:
+                heard = node in self._speaking or received != frames
+            if not heard and (gap or number - last >= max(self._silent, 3 * _slowest(self._in_use[node]))):
                 silent.append(node)
+                heard = True  # said once
+            if heard:
                 self._heard[node] = received, number
-            if not gap:
-                self._speaking.discard(node)
+            self._speaking.discard(node)
         if silent:
             self.lose_sight(silent, f"no frame of it was heard for {_SILENT_S:g} s")
 

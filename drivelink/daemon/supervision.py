@@ -113,6 +113,7 @@ class Supervisor:
 
     def _sync(self) -> None:
         """At a SYNC, use new mappings; configure nodes anew that say something else by SDO than is in use."""
+        self._check_overflow()
         for found in self._follower.sync():
             self._nodes[found.node].attempt_ns = self._loop.clock()
             text = f"{found.text}: it is configured again"
@@ -160,15 +161,17 @@ class Supervisor:
             self._joints.check(loop_joint)
         follower = self._follower
         if isinstance(follower, PassiveFollower):
-            unread = self._loop.source.errors.get(OVERFLOW, 0)
-            if unread > self._unread:
-                follower.lose_sight(None, "frames were lost by receive overflow")
-            self._unread = unread
             self._check_maps(follower)
         else:
             for node, refused in follower.refused.items():
                 self._events.begin(f"configure {node}", f"node {node} cannot be configured: {refused}")
         self.bus.check()
+
+    def _check_overflow(self) -> None:
+        unread, before = self._loop.source.errors.get(OVERFLOW, 0), self._unread
+        self._unread = unread
+        if unread > before and isinstance(self._follower, PassiveFollower):
+            self._follower.lose_sight(None, "frames were lost by receive overflow")
 
     def _check_maps(self, follower: PassiveFollower) -> None:
         doubts = follower.doubts

@@ -82,7 +82,7 @@ def require_covariance(rows: Sequence[Sequence[float]], size: int) -> None:
     )
     rounded = range_of("correlation").least
     std = np.sqrt(np.diag(matrix))
-    shares = matrix / np.maximum(np.outer(std, std), 1e-300)
+    shares = matrix / np.maximum(np.outer(std, std), 1e-200)
     symmetric = bool(np.allclose(shares, shares.T, atol=rounded))
     require(
         symmetric and float(np.min(np.linalg.eigvalsh(shares))) >= -rounded,

@@ -15,6 +15,7 @@ import numpy as np
 from estimator import _core
 from estimator.errors import EstimatorError
 from estimator.model import JointModel, require, require_finite
+from estimator.ranges import require_in_range
 from estimator.sample import Estimate, Record, Sample
 from estimator.settings import EstimatorSettings
 
@@ -53,6 +54,7 @@ class ResidualBaseline:
         sizes = {len(self.residual_nm), len(self.torque_nm), len(self.log_std)}
         require(len(sizes) == 1, "baseline: expected as many residuals as torques and standard deviations")
         require(self.seconds >= _LEAST_SECONDS, f"seconds: expected {_LEAST_SECONDS} or more")
+        require_in_range("seconds", self.seconds)
         for residual, torque, std in zip(self.residual_nm, self.torque_nm, self.log_std, strict=True):
             require_finite(0.0, strict=True, residual_nm=residual, torque_nm=torque)
             require_finite(0.0, log_std=std)
@@ -71,7 +73,7 @@ class ResidualBaseline:
                 log_std=tuple(float(x) for x in values["log_std"]),
                 seconds=int(values["seconds"]),
             )
-        except (KeyError, TypeError, ValueError, EstimatorError):
+        except (KeyError, TypeError, ValueError, OverflowError, EstimatorError):
             return None
 
 

@@ -89,6 +89,10 @@ def require_in_range(name: str, value: float, *, positive: bool = False) -> None
         EstimatorError: it is too large, too small, or not finite.
     """
     allowed = range_of(name)
+    try:
+        value = float(value)
+    except OverflowError:  # a whole number that no float holds
+        value = math.inf if value > 0 else -math.inf
     if not math.isfinite(value) or abs(value) > allowed.most or (positive and value < allowed.least):
         least = allowed.least if positive else -allowed.most
         raise EstimatorError(

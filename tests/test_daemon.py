@@ -271,15 +271,21 @@ def test_a_joint_file_that_is_gone_or_none_leaves_the_model_as_it_is(reloadable,
         b"",
         os.urandom(999),
         before + b"#" + bytes(300 << 10),
+        before.replace(b"sdo_timeout_s = 0.1", b"bitrate = " + b"9" * 400),
         before[: len(before) // 2],
         named,
     ):
         path.write_bytes(content)
         taken(reloader)
         assert len(made.run(20)) == 20 and made.loop_joint.pipeline.estimator is old
-    assert len(made.events) == 7 and "name: expected elbow, as it was at the start" in made.events[-1]
+    assert len(made.events) == 8 and "name: expected elbow, as it was at the start" in made.events[-1]
     assert all(text.startswith("the model stays as it is: ") and "elbow.toml" in text for text in made.events)
     path.write_bytes(before)
+    with monkeypatch.context() as broken:
+        broken.setattr(reloader, "_build", lambda _joint: 1 // 0)
+        taken(reloader)
+    assert made.events[-1] == "the model stays as it is: integer division or modulo by zero"
+    path.write_bytes(before + b"\n")
     taken(reloader)
     until(lambda: made.run(20) and made.loop_joint.pipeline.estimator is not old)
 

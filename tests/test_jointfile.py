@@ -14,6 +14,8 @@ from drivelink.errors import JointFileError
 from drivelink.jointfile import apart
 from estimator import make_estimator
 from estimator.effects import LIBRARY
+from estimator.errors import EstimatorError
+from estimator.model import require_covariance
 from estimator.ranges import range_of
 from estimator.sample import Sample
 
@@ -232,6 +234,19 @@ def test_a_joint_file_that_grows_without_end_is_one_line(tmp_path, text, line):
         with pytest.raises(JointFileError) as caught:
             read()
         assert line in str(caught.value) and "\n" not in str(caught.value) and len(str(caught.value)) < 600
+
+
+def test_numbers_that_no_float_holds_and_covariances_without_bounds_are_one_line():
+    """A whole number of TOML, and what becomes of JSON, may be as large as its line."""
+    for text in ("bitrate = " + "9" * 400, "sdo_retries = " + "9" * 400):
+        with pytest.raises(JointFileError, match=r"expected .* got inf$"):
+            jointfile.parse(ELBOW.replace("period_s = 0.001", text))
+    floor = "residual_nm = [0.1]\ntorque_nm = [1.0]\nlog_std = [0.1]\nseconds = "
+    for seconds in ("9" * 400, "inf", "1e300"):
+        joint = jointfile.parse(f"{ELBOW}[provenance.floor]\n{floor}{seconds}\n")
+        assert joint.model().motors[0].fit_rms_nm is None
+    with pytest.raises(EstimatorError, match="covariance: expected"):
+        require_covariance([[0.0, 1e60], [1e60, 1.0]], 2)
 
 
 def numeric_keys(kind: type, seen: set[type]) -> Iterator[str]:

@@ -23,7 +23,6 @@ from drivelink.daemon.status import EventLog
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.apart import load_apart
-from estimator.errors import EstimatorError
 
 _EVERY_S = 1.0  # minimum time between two reloads, against repeated changes
 _STEPS = 500  # steps of the new estimator before the cycle may have it: some milliseconds
@@ -119,7 +118,7 @@ class Reloader:
             joint = self._move(load_apart(self.path))
             self._refuse_changes(joint)
             built = self._build(joint)
-        except (DrivelinkError, EstimatorError) as error:
+        except Exception as error:  # noqa: BLE001 - whatever comes of a file, the next one is read
             self._events.report(f"the model stays as it is: {error}", logging.ERROR)
             self._thread = None
             return

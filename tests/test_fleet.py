@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -13,13 +14,14 @@ import diagnosiskit as kit
 import fleetkit
 import numpy as np
 import pytest
+from daemonkit import vsa_text
 from joints import write_csv
 
 pytest.importorskip("distributed", reason="the extra [fleet] is not installed")
 
 from drivelink import __version__, recording
 from drivelink.cli import main
-from drivelink.errors import RecordingError
+from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.fleet import analysis, storage, task
 from drivelink.fleet.joints import Joints
 from drivelink.fleet.storage import FleetError, Source, Store
@@ -35,6 +37,16 @@ def joints(fleet: Path) -> Joints:
 def source(path: Path) -> Source:
     ((found,), _) = storage.find([str(path)])
     return found
+
+
+def test_a_data_sheet_that_is_no_file_or_has_no_end_is_one_line(tmp_path):
+    (tmp_path / "elbow.toml").write_text(vsa_text().replace("node_id = 1", 'node_id = 1\neds = "drive.eds"'))
+    os.mkfifo(tmp_path / "pipe")
+    for place in (tmp_path / "pipe", Path("/dev/zero")):
+        (tmp_path / "drive.eds").symlink_to(place)
+        with pytest.raises(DrivelinkError, match=r"drive\.eds: cannot be read: expected a regular file"):
+            Joints.load(tmp_path)
+        (tmp_path / "drive.eds").unlink()
 
 
 def done(path: Path, joints: Joints, **more: Any) -> task.Outcome:

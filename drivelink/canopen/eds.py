@@ -21,7 +21,7 @@ from drivelink.plaintext import clean_text
 Sections = dict[str, dict[str, str]]
 Address = tuple[int, int]
 
-_MOST_BYTES = 4 << 20  # the longest in circulation have 1 MiB
+MAX_BYTES = 4 << 20  # the longest in circulation have 1 MiB
 _MOST_OBJECTS = 20_000  # compact arrays expanded; of those, some 2000
 _MOST_DIGITS = 40  # of a number: 64 bits in binary notation are not written
 
@@ -78,7 +78,7 @@ def load_eds(path: Path, node_id: int | None = None) -> DataSheet:
         DriveError: it cannot be read, or is not an EDS.
     """
     try:
-        raw = read_regular(path, _MOST_BYTES)
+        raw = read_regular(path, MAX_BYTES)
     except OSError as error:
         raise DriveError(f"{path}: cannot be read as an EDS: {error.strerror}") from error
     sheet = DataSheet(path=path)

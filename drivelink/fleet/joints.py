@@ -14,7 +14,9 @@ from typing import Any
 from urllib.parse import unquote
 
 from drivelink import jointfile
+from drivelink.canopen.eds import MAX_BYTES
 from drivelink.errors import DrivelinkError, RecordingError, UsageError
+from drivelink.files import read_regular
 from drivelink.fleet.storage import FleetError
 from drivelink.jointfile import JointFile
 from drivelink.recording.mapping import contained, joint_of
@@ -82,9 +84,10 @@ class Joints:
             raise FleetError(f"{folder}: expected joint files (*.toml) in this folder, found none")
         best: dict[str, tuple[str, Joint]] = {}
         for path in paths:
-            joint = jointfile.load(path)
+            given = jointfile.load_text(path)
+            joint = given.joint
             written = _written(joint.provenance)
-            one = Joint(joint.name, path.read_text(encoding="utf-8"), str(path), _eds(joint, path.parent))
+            one = Joint(joint.name, given.text, str(path), _eds(joint, path.parent))
             if joint.name in best and best[joint.name][0] == written:
                 raise FleetError(
                     f"{path}: joint {joint.name} is in {best[joint.name][1].where} too; expected one file, "
@@ -156,7 +159,7 @@ def _eds(joint: JointFile, base: Path) -> tuple[tuple[str, bytes], ...]:
         if Path(name).is_absolute() or ".." in Path(name).parts:
             continue  # only paths below the joint file can be recreated elsewhere
         try:
-            found.append((name, (base / name).read_bytes()))
+            found.append((name, read_regular(base / name, MAX_BYTES)))
         except OSError as error:
             raise DrivelinkError(f"{base / name}: cannot be read: {error.strerror}") from error
     return tuple(found)

@@ -66,6 +66,8 @@ class Network:
         self._wall_s = clock()
         self._sync_wall_s = self._wall_s - _WITHOUT_SYNC_S
         self._anchor_s = time.time()
+        self._stamp_s = 0.0  # of the last SYNC
+        self._stood = 0  # number of the last SYNC at which the world did not advance
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         for node in self.nodes:
@@ -236,11 +238,16 @@ class Network:
 
     def _periods(self, stamp_s: float) -> int:
         """Whole control periods since the last SYNC, phase-locked to it."""
-        late_s = stamp_s - self._anchor_s
-        if not -_LONGEST_CATCH_UP_S < late_s < _LONGEST_CATCH_UP_S:
+        since_s, self._stamp_s = stamp_s - self._stamp_s, stamp_s
+        if not -_LONGEST_CATCH_UP_S < since_s < _LONGEST_CATCH_UP_S:
             self._anchor_s = stamp_s  # the clock has jumped, or there was no SYNC for long
             return 1
-        periods = max(1, round(late_s / self._period_s))
+        late_s = stamp_s - self._anchor_s
+        # None where the SYNC before was late; several such in a row are a phase that is not locked yet.
+        least = 0 if self.syncs - self._stood > 1 / _PHASE_GAIN else 1
+        periods = max(least, round(late_s / self._period_s))
+        if periods == 0:
+            self._stood = self.syncs
         self._anchor_s += periods * self._period_s
         self._anchor_s += _PHASE_GAIN * (stamp_s - self._anchor_s)
         return periods

@@ -84,6 +84,8 @@ pub struct Assembler {
     pub missed: Option<i64>,
     /// Service bits of the status that hold for the sample just given, or the cycle just missed.
     pub flags: u32,
+    /// By how much the sample just given may be of an earlier moment, s.
+    pub late_s: f64,
 }
 
 impl Assembler {
@@ -215,12 +217,15 @@ impl Assembler {
             return None;
         }
         if self.usable() {
+            let late_s = if self.certain() { 0.0 } else { self.period };
             for decoder in self.decoders.iter_mut().filter(|decoder| decoder.timed() && decoder.suspect > 0) {
                 decoder.suspect -= 1;
                 decoder.owed = if decoder.suspect > 0 { decoder.owed } else { 0 };
                 self.cycle_fault = true;
             }
-            return Some(self.sample());
+            let sample = self.sample();
+            self.late_s = late_s;
+            return Some(sample);
         }
         let all_arrived = self.decoders.iter().all(|decoder| decoder.arrived || !decoder.timed());
         if self.note_missing() || self.spoiled || all_arrived {
@@ -356,6 +361,7 @@ impl Assembler {
 
     fn sample(&mut self) -> Sample {
         self.open = false;
+        self.late_s = 0.0;
         let mut flags = self.faulted | self.contradicted | self.misread;
         if self.cycle_fault {
             flags |= BUS_FAULT;

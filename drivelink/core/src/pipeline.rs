@@ -56,7 +56,7 @@ pub trait Step: Send {
 /// What a frame leads to.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Due {
-    /// A sample to be estimated, with the service bits that hold for it, and how late its SYNC was, s.
+    /// A sample to be estimated, with the service bits that hold for it, and how late it may be, s.
     Sample(Sample, u32, f64),
     /// A cycle of this number that gave no sample, with its service bits.
     Missed(i64, u32),
@@ -131,7 +131,8 @@ impl Pipeline {
         self.sequence = assembler.sequence;
         if let Some(sample) = sample {
             let before = usize::from(sample.sequence as i64 != self.sequence);
-            return Some(Due::Sample(sample, assembler.flags, self.late_s[before]));
+            let late_s = self.late_s[before].max(assembler.late_s);
+            return Some(Due::Sample(sample, assembler.flags, late_s));
         }
         let missed = assembler.missed.take()?;
         self.missed += 1;

@@ -44,6 +44,7 @@ impl Assembler {
             open: false,
             spoiled: false,
             cycle_fault: false,
+            late_s: 0.0,
             restart: false,
             unnumbered: false,
             faulted: 0,

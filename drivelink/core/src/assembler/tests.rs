@@ -61,3 +61,17 @@ fn a_joint_lacks_no_position_and_no_frame_has_two_senders() {
     let twice = Layout { node_id: 1, motor: None, tpdos: vec![tpdo.clone(), tpdo] };
     assert!(Assembler::new(&[twice], 0, true, 250, 1e-3).is_err());
 }
+
+#[test]
+fn a_sample_after_a_missing_frame_may_be_a_period_late_until_the_late_one_has_come() {
+    let mut made = assembler();
+    made.feed(SYNC_COB_ID, &[], 1);
+    made.feed(0x181, &drive(0, 0), 0);
+    made.feed(SYNC_COB_ID, &[], 1);
+    made.feed(0x183, &1i32.to_le_bytes(), 0);
+    assert!(made.feed(0x181, &drive(1, 0), 0).is_none());
+    assert_eq!((made.feed(SYNC_COB_ID, &[], 1).unwrap().sequence, made.late_s), (1, 1e-3));
+    made.feed(0x183, &1i32.to_le_bytes(), 0);
+    made.feed(0x183, &2i32.to_le_bytes(), 0);
+    assert_eq!((made.feed(0x181, &drive(2, 0), 0).unwrap().sequence, made.late_s), (2, 0.0));
+}

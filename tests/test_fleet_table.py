@@ -8,6 +8,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import chromium
 import fleetkit
 import numpy as np
 import pytest
@@ -225,6 +226,22 @@ def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_cha
     text = page(document)
     assert "<h1>1 of 1 joint needs a look: 1 lost</h1>" in text
     assert text.count('class="found"') == 2 and "134 → 2.00 % of the torque" in text
+
+
+CUT = "[...document.querySelectorAll('figure, .table')].filter(e => e.scrollWidth > e.clientWidth).length"
+
+
+@pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
+def test_a_phone_shows_charts_and_tables_whole(tmp_path):
+    rows = [
+        night("elbow", k, 150.0 + 4.0 * (k >= 12), ["coulomb_friction@motor"] if k >= 9 else [])
+        for k in range(20)
+    ]
+    (tmp_path / "fleet.html").write_text(page(summarise(rows, 0.05)), encoding="utf-8")
+    with chromium.Chromium(tmp_path / "profile") as browser:
+        browser.resize(390, 800)
+        browser.open((tmp_path / "fleet.html").as_uri())
+        assert browser.evaluate(CUT) == 0
 
 
 def test_the_examples_of_the_documentation_read_the_table(tmp_path, monkeypatch, capsys):

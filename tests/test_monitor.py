@@ -320,6 +320,16 @@ def test_the_residual_is_a_gauge_against_its_baseline_before_and_after():
     assert "residual 3.0" in view.line() and "8.1 % before its effects, 1.2 % after" in view.line()
 
 
+@pytest.mark.parametrize(
+    ("watching", "why"), [(True, "its filters are settling"), (False, "no baseline: drivelink fit")]
+)
+def test_a_residual_without_gauge_is_not_always_one_without_baseline(watching, why):
+    view = filled()
+    view.status = {"residual_nm": 0.0, "residual_alarm": {"active": watching, "watching": watching}}
+    assert snapshot(view, True, {})["status"]["no_gauge"].startswith(why)
+    assert why in "\n".join(lines(view, 120, 40))
+
+
 def test_every_view_says_what_to_do_on_a_model_alarm():
     view = filled()
     view.status = ALARM

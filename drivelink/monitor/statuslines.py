@@ -26,6 +26,8 @@ _SHORT_ADVICE = "model alarm: do not control on it; drivelink diagnose says why"
 _MOST = 16  # entries of a list that a view shows
 _WORDS = 200  # characters of one entry
 _GAUGE, _LABEL = 10, 11  # characters
+_NO_BASELINE = "no baseline: drivelink fit --write makes one"
+_SETTLING = "its filters are settling"
 _FULL = 2.0  # times its baseline where a gauge is full
 
 
@@ -74,6 +76,7 @@ class Shown:
     alarm: bool = False  # whether the model alarm is on
     location: str = ""  # likely location of the missing effect
     residual_nm: float | None = None  # of the whole model, N·m, or None
+    no_gauge: str = ""  # why `balances` is empty, where it is
     balances: tuple[ResidualGauge, ...] = ()  # residual and baseline per motor and of the link
     improved: tuple[float, float] | None = None  # relative error before and after diagnose
     events: tuple[Event, ...] = ()  # the last ones, newest first
@@ -115,6 +118,7 @@ def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> 
         alarm=alarm.get("active") is True,
         location=_text(alarm.get("location")),
         residual_nm=_number(status.get("residual_nm")),
+        no_gauge=_SETTLING if alarm.get("watching") is True else _NO_BASELINE,
         balances=_balances(alarm, motors),
         improved=_improved(model or {}),
         events=_events(status.get("events")),

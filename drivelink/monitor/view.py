@@ -328,8 +328,8 @@ class JointView:
             series = [(t.time_s, t.torque_nm, t.valid) for t in touches]
             return self._time_plot(width, height, "external torque over time, N·m", series)
         series = [(time_s, ratio, True) for time_s, ratio in self.history.residuals]
-        title, empty = "residual over time, × its baseline", "no baseline: drivelink fit --write makes one"
-        return self._time_plot(width, height, title, series, empty=empty)
+        title = "residual over time, × its baseline"
+        return self._time_plot(width, height, title, series, empty=shape(self.status or {}).no_gauge)
 
     def _flags(self) -> Text:
         text = Text(no_wrap=True)

@@ -241,6 +241,7 @@ def _describe(shown: Shown) -> dict[str, Any]:
         "alarm": shown.alarm,
         "advice": shown.advice,
         "residual_nm": shown.residual_nm,
+        "no_gauge": shown.no_gauge,
         "balances": [(b.name, b.residual_nm, b.baseline_nm, b.ratio) for b in shown.balances],
         "improved": shown.improved,
     }

@@ -205,7 +205,9 @@ def test_what_is_not_valid_is_a_gap_and_both_plots_share_their_time_axis(tmp_pat
     for axes in figures[0].axes:
         assert np.nanmax(axes.lines[0].get_ydata()) < 2.0
     torque, stiffness = figures[0].axes
-    assert torque.get_xlim() == stiffness.get_xlim()
+    assert torque.get_xlim() == stiffness.get_xlim() == (t[0], t[-1])
+    for axes in figures[0].axes:  # which part of the recording that is, is said
+        assert "not valid" in axes.get_legend_handles_labels()[1]
 
 
 def test_thinning_loses_no_peak():

@@ -225,11 +225,18 @@ def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, titl
 
 
 def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) -> Path:
-    """Draw the joint's flexibility torque and stiffness over one time axis; gaps where each is not valid."""
+    """Draw flexibility torque and stiffness over the whole recording; grey where each is not valid."""
     figure, axes = new_figure(title, rows=2)
     t = columns["time_s"]
     valid = {name: np.where(columns["valid"] > 0, values, np.nan) for name, values in columns.items()}
     axes[1].sharex(axes[0])
+    axes[0].set_xlim(t[0], t[-1] if t[-1] > t[0] else None)
+    for one, seen in zip(axes, ("torque_valid", "valid"), strict=True):
+        whole, void = one.get_xaxis_transform(), columns[seen] <= 0
+        if np.any(void):
+            one.fill_between(
+                t, 0, 1, where=void, transform=whole, color="#bbbbbb", lw=0, alpha=0.4, label="not valid"
+            )
     torque = np.where(columns["torque_valid"] > 0, columns["flexibility_torque_nm"], np.nan)
     curve = PlotCurve(t, torque, columns["flexibility_torque_std_nm"])
     over_time(axes[0], {"estimate": curve}, "torque / N·m", "Flexibility torque")

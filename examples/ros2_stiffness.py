@@ -52,7 +52,7 @@ def main(joint: str = "elbow", topic: str = "/dynamic_joint_states") -> None:
     def say() -> None:
         now_s = time.monotonic()
         node.get_logger().info(
-            f"{joint}: {stiffness.state(now_s)}, {stiffness.value_nm_rad(now_s):.1f} N·m/rad"
+            f"{joint}: {stiffness.state(now_s)}, {stiffness.value_nm_rad(now_s):.4g} N·m/rad"
         )
 
     node.create_subscription(DynamicJointState, topic, lambda m: stiffness.receive(m, time.monotonic()), 10)

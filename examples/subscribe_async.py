@@ -16,7 +16,7 @@ async def follow(joint: str, endpoint: str) -> None:
                 print(f"{joint}: nothing for half a second, the daemon is {subscription.state}")
             elif estimate.sequence % 500 == 0:
                 state = (subscription.status or {}).get("state")
-                print(f"{joint}: cycle {estimate.sequence}, {estimate.stiffness_nm_rad:.1f} N·m/rad, {state}")
+                print(f"{joint}: cycle {estimate.sequence}, {estimate.stiffness_nm_rad:.4g} N·m/rad, {state}")
 
 
 async def main(joints: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: str = "10") -> None:

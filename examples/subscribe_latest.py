@@ -23,7 +23,7 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
             gain = 0.1 * stiffness  # ... and here the controller uses it
             if round((deadline - start) / PERIOD_S) % 50 == 0:
                 age_ms = elbow.age_s * 1e3
-                print(f"{elbow.state:8} gain {gain:7.1f} N·m/rad  age {age_ms:6.2f} ms  gaps {elbow.gaps}")
+                print(f"{elbow.state:8} gain {gain:7.4g} N·m/rad  age {age_ms:6.2f} ms  gaps {elbow.gaps}")
             deadline += PERIOD_S
             time.sleep(max(0.0, deadline - time.monotonic()))
 

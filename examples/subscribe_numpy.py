@@ -20,7 +20,7 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
     steps_ms = np.diff(records["stamp_ns"].astype(np.int64)) / 1e6
     print(f"{len(records)} estimates of {joint}, {elbow.gaps} missing")
     print(f"period {np.mean(steps_ms):.3f} ms, from {np.min(steps_ms):.3f} to {np.max(steps_ms):.3f} ms")
-    print(f"stiffness {np.mean(records['stiffness_nm_rad']):.1f} N·m/rad")
+    print(f"stiffness {np.mean(records['stiffness_nm_rad']):.4g} N·m/rad")
     deflection = records["transmissions"]["deflection_rad"]  # (n, transmissions)
     print(f"deflection {np.round(deflection.min(axis=0), 4)} to {np.round(deflection.max(axis=0), 4)} rad")
 

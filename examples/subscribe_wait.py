@@ -28,7 +28,7 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
             passes += 1
             reaction_nm = -estimate.flexibility_torque_nm  # ... and here the controller uses it
             if passes % 500 == 0:
-                stiffness = f"{estimate.stiffness_nm_rad:.1f} ± {estimate.stiffness_std_nm_rad:.1f} N·m/rad"
+                stiffness = f"{estimate.stiffness_nm_rad:.5g} ± {estimate.stiffness_std_nm_rad:.2g} N·m/rad"
                 print(f"cycle {estimate.sequence}: {reaction_nm:+.3f} N·m, {stiffness}")
         print(f"{passes} passes, {elbow.gaps} cycles missing, {elbow.foreign} messages of a foreign writer")
 

@@ -26,15 +26,15 @@ def run(*command, **options):
 @pytest.mark.parametrize(
     ("name", "expected", "more"),
     [
-        ("subscribe_latest.py", r"live     gain    70\.0 N·m/rad", "1000"),
+        ("subscribe_latest.py", r"live     gain      70 N·m/rad", "1000"),
         ("subscribe_wait.py", "in control from cycle", "1000"),
         pytest.param(
             "subscribe_async.py",
-            r"elbow: cycle \d*[05]00, 700\.0 N·m/rad, running",
+            r"elbow: cycle \d*[05]00, 700 N·m/rad, running",
             "1000",
             marks=pytest.mark.slow,
         ),
-        ("subscribe_numpy.py", "stiffness 700.0 N·m/rad", "0.5"),
+        ("subscribe_numpy.py", "stiffness 700 N·m/rad", "0.5"),
     ],
 )
 def test_the_python_examples_run(daemon, name, expected, more):
@@ -75,7 +75,7 @@ def test_the_cpp_example_reads_the_daemon(cpp, daemon):
     if not (cpp / "subscribe").exists():
         pytest.skip("zenoh-pico is not installed (CMAKE_PREFIX_PATH)")
     out = run(cpp / "subscribe", "elbow", daemon, "20", timeout=60)
-    assert out.count("700.0 ± 3.0 N·m/rad, valid 1, observable 1") == 20
+    assert out.count("700 ± 3 N·m/rad, valid 1, observable 1") == 20
 
 
 @pytest.fixture(scope="module")

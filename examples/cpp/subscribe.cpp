@@ -23,7 +23,7 @@ bool show(const z_loaned_sample_t *sample, uint64_t *last, uint64_t *gaps) {
     *last = estimate.sequence;
     const auto now = std::chrono::system_clock::now().time_since_epoch();
     const int64_t now_ns = std::chrono::duration_cast<std::chrono::nanoseconds>(now).count();
-    std::printf("%" PRIu64 " %.3f N·m, %.1f ± %.1f N·m/rad, valid %d, observable %d, usable %d, %" PRId64
+    std::printf("%" PRIu64 " %.3f N·m, %.5g ± %.2g N·m/rad, valid %d, observable %d, usable %d, %" PRId64
                 " µs after its SYNC, %" PRIu64 " gaps\n",
                 estimate.sequence, estimate.flexibility_torque_nm, estimate.stiffness_nm_rad,
                 estimate.stiffness_std_nm_rad, drivelink_valid(&estimate),

@@ -37,9 +37,11 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         gaps += last.map_or(0, |last| estimate.sequence.saturating_sub(last + 1));
         last = Some(estimate.sequence);
         let now_ns = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as i128;
+        // Two digits of the uncertainty, and the value as far.
+        let places = (1.0 - estimate.stiffness_std_nm_rad.log10().floor()).clamp(0.0, 9.0) as usize;
         let written = writeln!(
             io::stdout(),
-            "{} {:.3} N·m, {:.1} ± {:.1} N·m/rad, valid {}, observable {}, usable {}, {} µs after its SYNC, {} gaps",
+            "{} {:.3} N·m, {:.places$} ± {:.places$} N·m/rad, valid {}, observable {}, usable {}, {} µs after its SYNC, {} gaps",
             estimate.sequence,
             estimate.flexibility_torque_nm,
             estimate.stiffness_nm_rad,

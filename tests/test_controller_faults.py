@@ -227,6 +227,23 @@ def test_one_bad_cycle_is_enough(what, reason):
     assert cycle or events[-1][2] == pytest.approx(0.011)
 
 
+def test_a_person_sees_where_the_joint_is_and_goes_and_a_program_its_phases(monkeypatch, capsys):
+    monkeypatch.setattr(time, "strftime", lambda _: "08:15:00")
+    for as_json, expected in (
+        (False, "08:15:00 safe: stopped\n08:15:00 identify link "),
+        (True, "{"),
+    ):
+        view, (controller, _) = program.View(as_json), moving()
+        view.report("safe", "stopped", 0.01)
+        for _ in range(3):  # once a second
+            view.show(controller)
+        printed = capsys.readouterr().out
+        assert printed.startswith(expected) and printed.count("\n") == (1 if as_json else 2)
+        assert as_json or " N·m/rad, motors " in printed
+    controller.phase = "run"
+    assert " (to +0.00) rad, stiffness " in str(controller)
+
+
 def test_torques_stay_within_the_limit():
     controller, _ = moving(torque_nm=0.01)
     largest = 0.0

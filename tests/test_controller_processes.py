@@ -40,7 +40,7 @@ def test_a_killed_daemon_and_the_way_back_in_three_processes(tmp_path):
     path = tmp_path / "vsa.toml"
     path.write_text(f"{head}{bus}[estimator]{rest.partition('[estimator]')[2]}", encoding="utf-8")
     # The example's own 10 ms belong to a machine of its own: here others may hold a core for longer.
-    options = ("--identify", "1", "--deadline", "0.08")
+    options = ("--identify", "1", "--deadline", "0.08", "--json")
     with process("sim", path) as drives:
         assert "ready" in drives.stdout.readline()
         with process("run", path) as daemon, python(kit.EXAMPLE / "run.py", path, *options) as controller:

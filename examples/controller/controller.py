@@ -91,6 +91,17 @@ class Controller:
         self._doubtful = self._known = False
         self._last = NO_TORQUE
 
+    def __str__(self) -> str:
+        """Where the joint is and, while it moves to a target, where it goes."""
+        if self._cycle is None:
+            return "no estimate yet"
+        estimate, (_, (q_d, sigma_d)) = self._cycle.estimate, self._way
+        q, sigma = f"{self._cycle.sample.link_position_rad:+.3f}", f"{estimate.stiffness_nm_rad:.3f}"
+        if self.phase in ("run", "react"):
+            q, sigma = f"{q} (to {q_d:+.2f})", f"{sigma} (to {sigma_d:.2f})"
+        torques = " ".join(f"{torque:+.3f}" for torque in self._last)
+        return f"link {q} rad, stiffness {sigma} N·m/rad, motors {torques} N·m"
+
     def set_springs(self, transmissions: Sequence[Mapping[str, Any]]) -> None:
         """Take the identified transmissions from the daemon's status; what is impossible is left out."""
         if len(transmissions) == 2 and all(entry.get("parameters") for entry in transmissions):

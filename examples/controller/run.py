@@ -4,7 +4,8 @@
     drivelink run examples/controller/joint.toml &      # the daemon
     python examples/controller/run.py examples/controller/joint.toml
 
-Each change of phase is one line of JSON. Ctrl-C takes the torque away and ends it.
+It prints each change of phase, and once a second where the joint is and where it goes; with --json, each
+change of phase as one line of JSON. Ctrl-C takes the torque away and ends it.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from drivelink.pubsub.wire import decode_sample
 from estimator.sample import Sample
 
 WAIT_S = 0.002  # for an estimate, before the dead man looks again
+SHOW_S = 1.0  # from one line about the joint to the next
 BUSY_S = 0.1  # while estimates are older, the daemon may be busy with the nodes: nothing is set up
 
 
@@ -74,6 +76,27 @@ class Process:
                 self.master.set_up(now_s)
 
 
+class View:
+    """What a person sees of a controller; `as_json`: what a program does."""
+
+    def __init__(self, as_json: bool) -> None:
+        self._json, self._next_s = as_json, 0.0
+
+    def report(self, phase: str, reason: str, age_s: float) -> None:
+        """Print a change of phase."""
+        if self._json:
+            event = {"phase": phase, "reason": reason, "time_s": time.monotonic(), "age_s": round(age_s, 4)}
+            print(json.dumps(event), flush=True)
+        else:
+            print(f"{time.strftime('%H:%M:%S')} {phase}{reason and ': '}{reason}", flush=True)
+
+    def show(self, controller: Controller) -> None:
+        """Print where the joint is, once a second."""
+        if not self._json and time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + SHOW_S
+            print(f"{time.strftime('%H:%M:%S')} {controller.phase:8} {controller}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     default = Settings()
@@ -83,6 +106,9 @@ def main() -> None:
     parser.add_argument("--identify", type=float, default=default.identify_s, help="identification, s")
     parser.add_argument("--torque", type=float, default=default.torque_nm, help="limit, N·m at the joint")
     parser.add_argument("--reaction", choices=["stop", "retract", "soften"], default=default.reaction)
+    parser.add_argument(
+        "--json", action="store_true", help="print changes of phase as JSON, and nothing else"
+    )
     args = parser.parse_args()
     joint = jointfile.load(args.joint)
     if joint.arrangement != "antagonistic" or joint.link.dynamics is None:
@@ -91,11 +117,8 @@ def main() -> None:
         deadline_s=args.deadline, identify_s=args.identify, torque_nm=args.torque, reaction=args.reaction
     )
 
-    def report(phase: str, reason: str, age_s: float) -> None:
-        event = {"phase": phase, "reason": reason, "time_s": time.monotonic(), "age_s": round(age_s, 4)}
-        print(json.dumps(event), flush=True)
-
-    stopped: list[int] = []
+    view, stopped = View(args.json), list[int]()
+    controller = Controller(joint, settings, view.report)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _: stopped.append(received))
     for line in realtime.acquire().lines:
@@ -109,8 +132,13 @@ def main() -> None:
     try:
         with subscribe(joint.name, prefix=joint.zenoh.prefix, session=session) as estimates:
             master = Master(network, joint, settings.torque_nm, 10.0 * settings.deadline_s)
-            process = Process(Controller(joint, settings, report), master, estimates, samples)
-            process.run(lambda: bool(stopped) or time.monotonic() >= end_s)
+            process = Process(controller, master, estimates, samples)
+
+            def done() -> bool:
+                view.show(controller)
+                return bool(stopped) or time.monotonic() >= end_s
+
+            process.run(done)
     finally:
         network.disconnect()
         close_session(session)

@@ -122,7 +122,7 @@ def faults() -> Iterator[Fault]:
         yield Fault("stuck", one, lambda x, size, rng: np.full_like(x, x[0]))
         for per_s in (0.01, 0.1) if signal != "torque" else ():
             yield Fault(f"drift {per_s:g} rad/s", one, partial(_drift, per_s=per_s))
-        for share in (0.02, 0.1):
+        for share in (0.02, 0.1, -0.1, 0.25):
             yield Fault(f"offset {share:.0%}", one, partial(_offset, share=share))
         for factor in (0.75, 0.9, 1.1, 1.25):
             yield Fault(f"gain {factor:g}", one, partial(_gain, factor=factor))

@@ -34,6 +34,13 @@ def test_little_of_what_is_valid_is_wrong(joint):
     assert sum(suspects) > 0.7 * len(suspects)
 
 
+@pytest.mark.parametrize("share", ["-10%", "10%", "25%"])
+def test_where_a_moved_zero_and_a_torque_offset_are_the_same_no_torque_is_valid(share):
+    (fault,) = (f for f in matrix.FAULTS if (f.signals, f.name) == (("torque",), f"offset {share}"))
+    outcome = matrix.outcome("constant", fault, 8.0, 8.0)
+    assert outcome.torque == 0 and outcome.torque_valid < 100  # those before it is noticed are right
+
+
 @pytest.mark.parametrize("joint", ["constant", "vsa-ii"])
 def test_health_keeps_its_valid(joint):
     healthy = matrix.outcome(joint, None, HEALTH_S, FAULT_S)

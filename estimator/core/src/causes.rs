@@ -184,13 +184,16 @@ impl Known<'_> {
             Cause::Stiffness => self.add_spring(&mut v, self.torque, 1.0),
             Cause::Shape => {
                 // The curve with another bend, the torque at the largest deflection as it was.
-                let whole: f64 = self.torque[..TERMS].iter().sum();
+                let whole = self.carried();
                 (v[SPRING.start], v[SPRING.start + 1]) = (whole, -whole);
                 1.0
             }
             Cause::Friction => put(&mut v, DRY, self.torque_rms),
-            Cause::TorqueZero => put(&mut v, OFFSET, self.torque_rms),
-            Cause::PositionZero => self.add_spring(&mut v, self.slope, self.deflection),
+            // On a linear spring these two are the same, and as large.
+            Cause::TorqueZero => put(&mut v, OFFSET, self.largest()),
+            Cause::PositionZero => {
+                self.add_spring(&mut v, self.slope, self.deflection * self.largest() / self.carried())
+            }
             Cause::Inertia => {
                 v[ACCELERATION] = self.motor.0;
                 1.0
@@ -209,6 +212,16 @@ impl Known<'_> {
             }
         };
         Some((v, unit))
+    }
+
+    /// The spring's torque at the largest deflection, N·m.
+    fn carried(&self) -> f64 {
+        self.torque[..TERMS].iter().sum()
+    }
+
+    /// The larger one of that and the motor's torque, N·m.
+    fn largest(&self) -> f64 {
+        self.torque_rms.max(self.carried().abs())
     }
 
     /// A multiple of a curve of the spring's; returns the factor.

@@ -364,12 +364,13 @@ impl Spring {
         projection.of(|phi| self.curve(phi).0)
     }
 
-    /// rms of τ_e over some rows, N·m.
+    /// rms of τ_e over some rows, N·m; `lost`: the zero, and with it the mean.
     #[must_use]
-    pub fn torque_rms(&self, projection: &Projection, rows: &Gram) -> f64 {
+    pub fn torque_rms(&self, projection: &Projection, rows: &Gram, lost: bool) -> f64 {
         let mut direction = [0.0; COLUMNS];
         place(&mut direction, &self.torque(projection), 1.0);
-        (rows.quadratic(&direction) / rows.rows).sqrt()
+        let mean = if lost { rows.times(&direction)[balance::OFFSET] / rows.rows } else { 0.0 };
+        (rows.quadratic(&direction) / rows.rows - mean * mean).max(0.0).sqrt()
     }
 
     /// σ as a sum of the family's functions.

@@ -200,7 +200,7 @@ impl Blocks {
             let more = omitted.iter().flatten().zip(attenuated.iter().flatten());
             let entries = chosen.covariance.iter_mut().flatten().zip(more);
             entries.for_each(|(v, (omitted, attenuated))| *v += omitted + attenuated);
-            self.torque = self.spring.torque_rms(&projection, &total);
+            self.torque = self.spring.torque_rms(&projection, &total, self.lost);
             (self.posterior, self.frame) = (Some(chosen), Some(frame));
             break;
         }

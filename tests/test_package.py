@@ -122,7 +122,7 @@ def test_the_client_alone_subscribes_with_numpy_and_zenoh_and_nothing_compiled(t
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 RUN = [*PROJECT["project"]["dependencies"], *PROJECT["build-system"]["requires"]]
-CI = [*RUN, *(line for extra in ("test", "lint", "docs") for line in EXTRAS[extra])]
+CI = [*RUN, *(line for extra in ("test", "lint", "docs", "dbc", "foxglove") for line in EXTRAS[extra])]
 
 
 def locked(file: str) -> dict[str, list[str]]:

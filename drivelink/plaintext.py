@@ -79,7 +79,7 @@ def stamped(text: str, stream: TextIO, indent: int = 9) -> str:
     if not stream.isatty():
         return text if "JOURNAL_STREAM" in os.environ else f"{time.strftime('%H:%M:%S')} {text}"
     columns = min(100, shutil.get_terminal_size().columns)
-    line = f"{time.strftime('%H:%M:%S')} {text}"
+    line = spelt(f"{time.strftime('%H:%M:%S')} {text}", getattr(stream, "encoding", None) or "utf-8")
     return textwrap.fill(line, columns, subsequent_indent=" " * indent, break_on_hyphens=False)
 
 

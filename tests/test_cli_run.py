@@ -87,3 +87,6 @@ def test_a_long_line_is_stamped_and_folded_on_a_terminal_only(monkeypatch):
         assert re.match(r"\d\d:\d\d:\d\d W this", folded)
         assert (max(map(len, folded.splitlines())) <= 100) is terminal
         assert " ".join(folded.split())[9:] == text.strip()
+    console = SimpleNamespace(isatty=lambda: True, encoding="ascii")  # which needs three columns for a ±
+    assert max(map(len, stamped("0.3 ± 0.1, " * 30, console).splitlines())) <= 100
+    assert "±" not in stamped("0.3 ± 0.1", console)

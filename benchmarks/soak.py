@@ -44,6 +44,7 @@ from faultstage import Stage
 from faultstages import LockstepStage, RealStage
 
 from estimator.sample import FloatArray, Status
+from sim.canopen.drive import PowerState
 
 FILLING_S = 60.0
 WAY_BACK_S = 5.0
@@ -183,7 +184,7 @@ class Soak:
             self._start(stage, played[1])
         stage.run(max(played[0].seconds - wait, played[-1].seconds))
         for _ in range(20):  # the other fault may have swallowed the reset of a drive
-            if len(played) == 1 or not stage.document()["nodes"]["2"]["fault"]:
+            if len(played) == 1 or stage.node(2).machine.state is not PowerState.FAULT:  # heard of or not
                 break
             stage.mend(2)
             stage.run(0.5)

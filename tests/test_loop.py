@@ -349,6 +349,7 @@ def test_only_the_page_itself_can_accept(friction, tmp_path):
         evil = "evil.example"
         for headers in ({"X_Drivelink_Token": "guess"}, {"Origin": f"http://{evil}"}, {"Host": evil}):
             assert ask(allowed, "accept", **headers)[0] == 403
+        assert ask(allowed, "accept", Content_Length="-1")[0] == 400  # and reads no end of it
         assert "newer finding" in ask(allowed, "accept", "another")[1]["error"]
         assert path.read_text() == ELBOW.read_text()
         assert "coulomb_friction" in ask(allowed, "proposal")[1]["difference"]

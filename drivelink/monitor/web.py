@@ -307,7 +307,7 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             try:
                 length = int(self.headers.get("Content-Length") or 0)
-                asked = decode_document(self.rfile.read(min(length, _MOST_BODY)))
+                asked = decode_document(self.rfile.read(max(0, min(length, _MOST_BODY))))
             except (ValueError, ZenohError):
                 self.send_error(HTTPStatus.BAD_REQUEST)
                 return

@@ -207,6 +207,13 @@ def test_a_diagnosis_that_waits_for_the_processors_says_so(tmp_path, monkeypatch
     assert said[5] == said[-1] == "what the model may lack is being looked for"
     assert waits in said[12] and waits not in said[25] and len(set(said)) == 2
     assert _of_process(os.getpid())[0] == "R"
+    # A process that has said what it found ends late, too: that finding stays.
+    finding.write(made, finding.begun(made, finding.NOTHING, "the model is sufficient"))
+    monkeypatch.setattr("drivelink.loop.queue._of_process", lambda _: ("R", cpu_s))
+    for _ in range(20):
+        now_s += 1.0
+        diagnoses.step()
+    assert finding.line(finding.read(made)) == "the model is sufficient"
 
 
 def test_accepting_writes_the_file_keeps_the_old_one_and_can_be_undone(friction, tmp_path, capsys):

@@ -103,6 +103,9 @@ class Diagnoses:
 
     def _say(self, state: str, sentence: str) -> None:
         if self._recording is not None:
+            found = finding.read(self._recording)
+            if state == finding.DIAGNOSING and found is not None and found["state"] != state:
+                return  # it is done: a process of idle priority takes its time to end
             with suppress(DrivelinkError):  # of a full disk: the black box says so
                 finding.write(self._recording, finding.begun(self._recording, state, sentence))
 

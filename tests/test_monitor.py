@@ -26,7 +26,7 @@ from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.web import snapshot
 from drivelink.output.numbers import number, with_interval
 from drivelink.pubsub.wire import ExternalMessage
-from estimator.sample import Estimate, Status, TransmissionEstimate
+from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
 STATUS = {
     "state": "running", "rate_hz": 999.8, "cycles": 5000, "missed_cycles": 2, "cpu_fraction": 0.123,
@@ -139,6 +139,20 @@ def test_the_page_gets_each_external_torque_once_and_a_gap_where_it_is_not_valid
         touched(k, 1)
     again = snapshot(view, True, since)
     assert again["restart"] and [one[0] for one in again["touches"]] == [0.0]
+
+
+def test_no_curve_over_time_goes_on_across_a_gap():
+    view = filled(n=10)
+    for k in (*range(10, 500, 10), *range(2500, 3000, 10)):  # two seconds of nothing
+        view.update(estimate(k), k * 1e-3)
+        view.update_external(ExternalMessage(k, k * 1_000_000, 1, 0.5, 0.1), k * 1e-3)
+        view.history.add_sample(Sample(k, (0.1,) * 2, (0.2,) * 2, (0.3,) * 2), k * 1e-3)
+        view.history.add_residual(0.5)
+    sent = snapshot(view, True, {})
+    assert json.dumps(sent, allow_nan=False)
+    curves = [[(m[0], m[1]) for m in sent[name]] for name in ("moments", "touches", "residuals")]
+    for curve in [*curves, [(time_s, torques[0]) for time_s, torques, *_ in sent["signals"]]]:
+        assert [value for time_s, value in curve if 0.495 < time_s < 2.5] == [None]
 
 
 def test_the_curve_grows_and_keeps_the_latest_value_of_each_place():

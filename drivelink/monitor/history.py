@@ -134,7 +134,7 @@ class JointHistory:
             elif since < 0.999 * self._apart_s:
                 return
             elif since > max(_GAP_S, 3.0 * self._apart_s):
-                moments.append(Moment(moments[-1].time_s + self._apart_s, *(math.nan,) * 5, False))
+                self._break_off(moments[-1].time_s + self._apart_s)
         moments.append(
             Moment(
                 time_s,
@@ -155,6 +155,18 @@ class JointHistory:
             self.doubtful = self._new_curves(estimate)
         for curve, one in zip(self.curves if usable else self.doubtful, estimate.transmissions, strict=True):
             curve.add(one.deflection_rad, one.stiffness_nm_rad, one.stiffness_std_nm_rad)
+
+    def _break_off(self, time_s: float) -> None:
+        """Nothing came for a while: no curve over time goes on across that."""
+        nan = math.nan
+        self.moments.append(Moment(time_s, *(nan,) * 5, False))
+        if self.touches:
+            self.touches.append(Touch(time_s, nan, nan, False, False))
+        if self.residuals:
+            self.residuals.append((time_s, nan))
+        if self.signals:
+            lost = (nan,) * len(self.signals[-1][1].motor_position_rad)
+            self.signals.append((time_s, Sample(0, lost, lost, lost)))
 
     @staticmethod
     def _new_curves(estimate: EstimateMessage) -> tuple[GrowingCurve, ...]:

@@ -102,6 +102,10 @@ def test_the_finding_says_what_since_when_and_the_error_before_and_after(frictio
     assert found["error"]["after_rms_nm"] < 0.25 * found["error"]["before_rms_nm"]
     proposed = jointfile.load(proposal_file(friction))
     assert [one.name for one in proposed.motor[0].effect] == ["deflection_offset", "coulomb_friction"]
+    assert {line.partition(":")[0] for line in found["parameters"]} == {
+        "Coulomb friction (motor)",
+        "transmission",
+    }
 
 
 @pytest.fixture

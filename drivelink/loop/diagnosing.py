@@ -80,9 +80,10 @@ def _parameters(outcome: Diagnosis, joint: JointFile, units: Units) -> list[str]
         for name, value in one.parameters.items()
     ]
     for number, (one, motor) in enumerate(zip(outcome.transmissions, joint.motor, strict=True), start=1):
+        where = f"motor {number}" if len(joint.motor) > 1 else "transmission"
         for name, value in one.parameters.items():
             declared = motor.transmission.parameters.get(name)
-            line = f"transmission {number}: {name} = {units.value(name, value, one.std.get(name))}"
+            line = f"{where}: {name} = {units.value(name, value, one.std.get(name))}"
             lines.append(
                 line + (f", was {units.value(name, declared, None)}" if declared is not None else "")
             )

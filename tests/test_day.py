@@ -148,5 +148,6 @@ def test_the_page_of_a_short_day_can_be_read_on_a_phone(tmp_path):
             assert last > 250  # what was found has a line of its own
             assert browser.evaluate("document.querySelector('[aria-pressed=true]').textContent") == "10 min"
             assert browser.evaluate("text(5e-7, 5e-7)") == "5e−7"
+            assert browser.evaluate("$('friction').shown.high") > 0.3 + 1.96 * 0.01  # its band is in the plot
     finally:
         web.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -301,6 +302,23 @@ def test_the_residual_has_fallen_when_the_new_models_own_test_allows_it_in_motio
     assert never.update({}, {}, 60.0) is False and "no daemon" in never.sentence()
 
 
+def test_after_an_undo_there_is_no_fall_to_wait_for(tmp_path, monkeypatch, capsys):
+    path, model = tmp_path / "elbow.toml", {"provenance": {"accepted": {"time": "now"}}}
+    accepted = '[provenance.accepted]\ntime = "now"\nbefore = "old.toml"\nrecording = "none"\n'
+    path.write_text(ELBOW.read_text() + accepted)
+    (tmp_path / "old.toml").write_text(ELBOW.read_text())
+    said = iter([model, model, {"provenance": {}}])
+
+    class Live(SimpleNamespace):
+        status = status(0.9, alarm=True)
+        model = property(lambda _: next(said))
+
+    monkeypatch.setattr("drivelink.cli.accept.subscribe", lambda *_, **__: contextlib.nullcontext(Live()))
+    assert cli.main(["accept", str(path), "--undo"]) == 0
+    assert capsys.readouterr().out.endswith("the daemon has the old joint file in use again\n")
+    assert path.read_text() == ELBOW.read_text()
+
+
 def test_the_finding_is_published_to_views_queries_and_ros(friction, tmp_path):
     path = copied(friction, tmp_path)
     endpoint = zenohkit.free_endpoint()
@@ -366,7 +384,10 @@ def test_only_the_page_itself_can_accept(friction, tmp_path):
         assert "coulomb_friction" in ask(allowed, "proposal")[1]["difference"]
         assert "is written" in ask(allowed, "accept")[1]["text"]
         assert "coulomb_friction" in path.read_text()
-        assert "trial" in json.loads(allowed.event({}))["joints"]["demo-elbow"]
+        shown = json.loads(allowed.event({}))["joints"]["demo-elbow"]
+        assert "trial" in shown and not shown["undoable"]  # the daemon has it not yet
+        nothing.views["demo-elbow"].model = {"provenance": jointfile.load(path).provenance}
+        assert json.loads(allowed.event({}))["joints"]["demo-elbow"]["undoable"]
         assert "as it was" in ask(allowed, "undo")[1]["text"] and path.read_text() == ELBOW.read_text()
     finally:
         allowed.close()

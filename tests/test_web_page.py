@@ -71,6 +71,19 @@ def test_the_page_shows_numbers_flags_gauge_and_nodes_and_that_the_monitor_has_e
     assert flags == "no connection" and link.startswith("drivelink monitor has ended")
 
 
+def test_undo_stays_on_the_page_when_a_newer_finding_has_come():
+    assert page(
+        """
+        const hidden = (state, undoable) => {
+          showFinding({ finding: { state, sentence: "", cause: "", since: null, recording: "", error: [], details: [] },
+                        acceptable: true, undoable });
+          return document.getElementById("undo").hidden;
+        };
+        return [hidden("proposed", false), hidden("accepted", true), hidden("diagnosing", true)];
+        """
+    ) == [True, False, False]
+
+
 def test_the_pointer_reads_the_curve_at_its_place():
     text, moment, hidden = page(
         SPAN

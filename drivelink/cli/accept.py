@@ -55,14 +55,14 @@ def run(args: argparse.Namespace) -> int:
         old = accept(offer)
         say(f"{args.joint} is written; the old one is {old}")
         result |= {"accepted": True, "old": str(old)}
-    trial = _watch(args.joint, quiet=args.json)
+    trial = _watch(args.joint, undone=args.undo, quiet=args.json)
     say(trial.sentence())
-    if trial.fallen is False and trial.in_use and not args.undo:
+    if trial.fallen is False and trial.in_use:
         say(f"drivelink accept {args.joint} --undo puts the old joint file back")
     if args.json:
         ratios = list(trial.ratios)
         print(json.dumps({**result, "in_use": trial.in_use, "fallen": trial.fallen, "ratios": ratios}))
-    return 0 if trial.fallen else 1
+    return 0 if trial.over and trial.fallen is not False else 1
 
 
 def _asked() -> bool:
@@ -75,12 +75,12 @@ def _asked() -> bool:
         return False
 
 
-def _watch(path: Path, *, quiet: bool) -> Trial:
-    """Follow the daemon until the residual has fallen, or a minute is over."""
-    source, trial, next_s = jointfile.load_text(path), Trial(path, time.monotonic()), 0.0
+def _watch(path: Path, *, undone: bool, quiet: bool) -> Trial:
+    """Follow the daemon until the residual has fallen or the old file is in use, or a minute is over."""
+    source, trial, next_s = jointfile.load_text(path), Trial(path, time.monotonic(), undone=undone), 0.0
     name, zenoh = source.joint.name, source.joint.zenoh
     with subscribe(name, endpoint=zenoh.endpoint, config=source.zenoh_config, prefix=zenoh.prefix) as live:
-        while trial.fallen is None:
+        while not trial.over:
             now_s = time.monotonic()
             trial.update(live.status or {}, live.model or {}, now_s)
             if not quiet and now_s >= next_s:

@@ -45,7 +45,7 @@ class Proposal(NamedTuple):
         lines += [f"  {text}" for text in found.get("parameters") or ()]
         if all(isinstance(error.get(key), float) for key in ("before_rms_nm", "after_rms_nm")):
             fall = f"{error['before_rms_nm']:.4g} N·m before, {error['after_rms_nm']:.4g} N·m after"
-            lines.append(f"error of the motor torque, held-out data: {fall}")
+            lines.append(f"error of the torque on held-out data: {fall}")
         lines += [f"  {text}" for text in (found.get("report") or {}).get("advice") or ()]
         return [clean_text(line) for line in [*lines, *self.difference().split("\n")]]
 
@@ -161,24 +161,36 @@ def accepted_at(joint: JointFile | Mapping[str, Any]) -> str:
 
 
 class Trial:
-    """Whether the residual falls to its baseline once the daemon has the new model."""
+    """Whether the residual falls to its baseline once the daemon has the joint file that was written.
 
-    def __init__(self, path: Path, now_s: float) -> None:
-        self.in_use = False  # the daemon has the new model
+    Args:
+        undone: it is the old one again: whether the daemon has it is all there is to see.
+    """
+
+    def __init__(self, path: Path, now_s: float, *, undone: bool = False) -> None:
+        self.in_use = False  # the daemon has the joint file
         # residual over baseline of each balance in the newest second, or empty
         self.ratios: tuple[float, ...] = ()
         self.fallen: bool | None = None  # True: it has; False: not within a minute; None: not decided yet
         self._accepted, self._end_s = accepted_at(load(path)), now_s + PATIENCE_S
+        self._undone = undone
         self._quiet = self._moved = 0
         self._last: object = None
 
+    @property
+    def over(self) -> bool:
+        """Whether nothing more is to come."""
+        return self.fallen is not None or (self._undone and self.in_use)
+
     def update(self, status: Mapping[str, Any], model: Mapping[str, Any], now_s: float) -> bool | None:
         """Process what the daemon says now; return `fallen`."""
-        if self.fallen is not None:
+        if self.over:
             return self.fallen
         if not self.in_use and model and accepted_at(model) == self._accepted:
             self.in_use = True
             self._last = _residuals(status)  # of the model before
+        if self.over:
+            return self.fallen
         if self.in_use:
             self._judge(status)
         if self._quiet >= _QUIET_SECONDS:
@@ -206,12 +218,14 @@ class Trial:
         level = f"{max(self.ratios):.2g} × its baseline" if self.ratios else "not measured yet"
         if self.fallen:
             return f"the residual has fallen, within its limit for {_QUIET_SECONDS} s of motion: now {level}"
-        if self.fallen is None:
-            return (
-                f"the residual is {level}" if self.in_use else "waiting for the daemon to take the new model"
-            )
         if not self.in_use:
-            return "no daemon has taken the new model within a minute: it is in use from its next start on"
+            if self.fallen is None:
+                return "waiting for the daemon to take the joint file"
+            return "no daemon has taken the joint file within a minute: it is in use from its next start on"
+        if self._undone:
+            return "the daemon has the old joint file in use again"
+        if self.fallen is None:
+            return f"the residual is {level}"
         if not self._moved:
             return "the joint has not moved enough within a minute to tell whether the residual has fallen"
         return f"the residual has not fallen within a minute: it is {level}"

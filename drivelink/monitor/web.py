@@ -23,6 +23,7 @@ from typing import Any
 
 from drivelink.errors import UsageError, ZenohError
 from drivelink.loop import finding as findings
+from drivelink.loop.acceptance import accepted_at
 from drivelink.monitor.history import Moment, Touch, model_curves
 from drivelink.monitor.statuslines import Shown, shape
 from drivelink.monitor.view import JointView
@@ -134,8 +135,12 @@ class WebView:
             }
             acceptance = self.acceptance
             if acceptance is not None and acceptance.joint in joints:
-                joints[acceptance.joint]["trial"] = acceptance.trial(self._watcher.views[acceptance.joint])
-                joints[acceptance.joint]["acceptable"] = True
+                view = self._watcher.views[acceptance.joint]
+                joints[acceptance.joint] |= {
+                    "trial": acceptance.trial(view),
+                    "acceptable": True,
+                    "undoable": bool(accepted_at(view.model)),
+                }
         return json.dumps({"joints": joints}, allow_nan=False).encode()
 
 

@@ -51,7 +51,7 @@ class WebAcceptance:
         try:
             if action == "undo":
                 old = undo(self._path)
-                self._trial = Trial(self._path, time.monotonic())
+                self._trial = Trial(self._path, time.monotonic(), undone=True)
                 return {"text": f"{self._path.name}: as it was before the acceptance ({old.name})"}
             offer = proposal(self._path)
             if action == "proposal":

@@ -19,13 +19,16 @@ from test_read_back import forge
 
 from drivelink import cli, jointfile, subscribe
 from drivelink.errors import RecordingError
-from drivelink.jointfile import parse
+from drivelink.jointfile import JointText, parse
+from drivelink.loop.diagnosing import _read
 from drivelink.pubsub.publisher import JointPublisher, describe_model, to_json
 from drivelink.pubsub.session import close_session, open_client, open_session
 from drivelink.pubsub.wire import EstimateMessage
 from drivelink.recording import formats, read
+from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import mapping_document, recorded_layouts
+from drivelink.recording.mcapfile import recorded_cycles
 from drivelink.recording.playback import open_playback
 from drivelink.recording.recorder import daemon_layouts
 from drivelink.recording.sinks import Sink
@@ -205,6 +208,21 @@ def test_raw_frames_and_samples_make_the_same_record(recorded):
         assert np.array_equal(first.motor_position_rad, other.motor_position_rad)
         assert np.array_equal(first.motor_torque_nm, other.motor_torque_nm)
         assert first.period_s == other.period_s
+
+
+def test_a_kept_recording_whose_samples_were_dropped_is_diagnosed_by_its_frames(recorded, tmp_path):
+    text, kept = daemonkit.vsa_text(), tmp_path / "kept.mcap"
+    sink = open_sink(kept, recorded.joint, text)
+    for frame in read_frames(recorded.folder / "r.log"):
+        sink.frame(frame.stamp_ns, frame.can_id, frame.data)
+    for played in recorded_cycles(recorded.folder / "r.mcap", 2):
+        if played.sequence % 10 > 2:
+            sink.sample(played.sample, BEGIN_NS + played.sequence * 1_000_000)
+    sink.close()
+    source = JointText(joint=recorded.joint, text=text, folder=recorded.folder, name="vsa.toml")
+    whole = read(recorded.folder / "r.csv", recorded.joint)
+    assert len(read(kept, recorded.joint).sequence) < 0.75 * len(whole.sequence)
+    assert np.array_equal(_read(kept, source).motor_torque_nm, whole.motor_torque_nm)
 
 
 def asked_over_zenoh(joint, layouts, endpoint, folder):

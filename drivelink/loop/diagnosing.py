@@ -19,7 +19,7 @@ import numpy as np
 from drivelink import recording as recordings
 from drivelink.errors import DrivelinkError
 from drivelink.files import write_whole
-from drivelink.jointfile import JointFile, apply_diagnosis
+from drivelink.jointfile import JointFile, JointText, apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from drivelink.loop import finding
 from drivelink.loop.finding import page_file, proposal_file
@@ -27,6 +27,7 @@ from drivelink.output import report, sentences
 from drivelink.output.comparison import simulated
 from drivelink.output.numbers import Units
 from drivelink.plaintext import log_to_stderr
+from drivelink.recording.canframes import read_frame_record
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
 from estimator.diagnosis import Diagnosis, Errors, diagnose
@@ -124,7 +125,7 @@ def make(recording: Path) -> dict[str, Any]:
     """
     begin_s = time.monotonic()
     source = joint_of(recording, None)
-    record = recordings.read(recording, source.joint)
+    record = _read(recording, source)
     model = source.joint.model()
     rose = since(seconds_of(record, model)) if can_monitor(model) else None
     part = record if rose is None else record.rows(record.sequence > rose[1])
@@ -157,6 +158,18 @@ def make(recording: Path) -> dict[str, Any]:
         "took_s": round(time.monotonic() - begin_s, 1),
         "report": report.as_json(outcome, runs, recording.name),
     }
+
+
+def _read(recording: Path, source: JointText) -> Record:
+    """Read the samples, or the frames where more of them came: zenoh drops samples on a busy machine."""
+    record = recordings.read(recording, source.joint)
+    if len(record.sequence) > int(record.sequence[-1] - record.sequence[0]):
+        return record
+    try:
+        frames = read_frame_record(recording, source.joint, source.folder, None)
+    except DrivelinkError:
+        return record
+    return max(record, frames, key=lambda one: len(one.sequence))
 
 
 def _has_changed(part: Record, joint: JointFile, outcome: Diagnosis) -> bool:
@@ -217,7 +230,9 @@ def main() -> int:
     try:
         found = make(recording)
     except (DrivelinkError, EstimatorError) as error:
-        found = finding.begun(recording, finding.FAILED, f"not diagnosed: {error}")
+        found = finding.begun(
+            recording, finding.FAILED, f"not diagnosed: {error}: drivelink keep makes another recording"
+        )
     finding.write(recording, found)
     _LOG.warning("%s: %s", found["joint"], found["sentence"])
     return 0

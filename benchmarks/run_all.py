@@ -1,6 +1,6 @@
 """Every claim of speed and accuracy in one command: writes results.md beside this file.
 
-    python benchmarks/run_all.py [--quick] [--only NAME ...] [--out DIR]
+    python benchmarks/run_all.py [--quick] [--only NAME ...] [--out FILE]
 
 Each section is a program of its own that can be run alone (README.md says what it measures). With `--only`,
 the other sections of an earlier run are kept, each with the time and the load of the machine it was run at.

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivelink import cli, jointfile
+from drivelink import cli, jointfile, recording
 from drivelink.demo.simulate import alter, world_from_joint
-from estimator.diagnosis import motion
+from estimator.diagnosis import diagnose, motion
 from estimator.diagnosis.fourier import Limits, Shape
+from estimator.diagnosis.problem import Problem
 from estimator.driven import driven
 from estimator.freerun import free_run
 from estimator.model import Effect
@@ -30,14 +31,14 @@ def limits():
     )
 
 
-def written(folder, excitation, name="run.csv", seconds=8.0):
-    """The elbow with backlash, moved so, and its recording."""
+def written(folder, excitation, name="run.csv", seconds=8.0, effect="backlash=0.003"):
+    """The elbow with an effect, moved so, and its recording."""
     joint = folder / "elbow.toml"
     text = ELBOW.read_text(encoding="utf-8")
     assert text.count('{ kind = "rich" }') == 1
     joint.write_text(text.replace('{ kind = "rich" }', excitation) + "\n" + MOTION)
     world = world_from_joint(jointfile.load(joint), file=joint)
-    alter(world, ["backlash=0.003"], {})
+    alter(world, [effect], {})
     columns = record(world, seconds)
     rows = np.column_stack([columns[column] for column in COLUMNS])
     np.savetxt(folder / name, rows, "%.9g", ",", header=",".join(COLUMNS), comments="")
@@ -71,6 +72,16 @@ def test_what_a_driven_model_reads_its_free_run_gives_back():
         changed = replace(model, motors=(replace(model.motors[0], effects=effects),))
         for run in driven(path, changed):
             assert min(free_run(run, changed, 1.0).fit_percent.values()) > 97.0
+
+
+def test_what_the_likeliest_rival_explains_is_no_noise_of_the_motion_to_come(tmp_path):
+    poor = '{ kind = "sines", amplitude_nm = 3.0, frequency_hz = 0.7 }'
+    joint, run = written(tmp_path, poor, effect="coulomb_friction=0.5")
+    model, record = jointfile.load(joint).model(), recording.read(run)
+    outcome = replace(diagnose(record, model), effects=())  # named or not: the recording is the same
+    rivals = motion._Rivals(Problem([record], model, outcome.bandwidth_hz), outcome, 8.0, limits())
+    assert rivals.models[0].motors[0].effects[-1].name == "coulomb_friction"
+    assert np.std(rivals.noise[2]) < 0.1 * 0.5
 
 
 @pytest.mark.slow

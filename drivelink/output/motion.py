@@ -58,8 +58,8 @@ def as_json(motion: NextMotion) -> dict[str, Any]:
 def section(motion: NextMotion, units: Units) -> Section:
     """Describe and draw it."""
     said = (
-        f"This motion of {motion.time_s[-1]:.3g} s is expected to tell them apart. Record it with the "
-        "drive's position loop, and diagnose that recording."
+        f"This motion of {motion.time_s[-1]:.3g} s is expected to tell which it is with a probability of "
+        f"{motion.decides:.2f}. Record it with the drive's position loop, and diagnose that recording."
     )
     rows: Rows = []
     for one in as_json(motion)["rivals"]:

@@ -131,7 +131,7 @@ class _Rivals:
             raise EstimatorError("the diagnosis leaves no rivals that a motion could tell apart")
         self.fitted = [fitted[k] for k in order]
         self.now = now[order] / np.sum(now[order])
-        self.noise = _noise(problem, found, self.period_s, seconds)
+        self.noise = _noise(problem, self.fitted[0], self.period_s, seconds)
 
     def score(self, shape: Shape) -> FloatArray:
         """Return (w,) how far each motion tells the rivals apart: mean of how surely each is told."""
@@ -204,10 +204,10 @@ class _Rivals:
 
 
 def _noise(
-    problem: Problem, found: Fitted, period_s: float, seconds: float
+    problem: Problem, likeliest: Fitted, period_s: float, seconds: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rounding of the motors' readings (n, m) and the link's (n, 1), as of so many samples' mean; and (n, m)
-    of torque, what a fit leaves of the first recording, repeated.
+    of torque, what the likeliest rival leaves of the first recording, repeated.
     """
     record, rows = problem.records[0], round(seconds / period_s)
     draw, every = np.random.default_rng(0), round(period_s / problem.period_s)
@@ -219,7 +219,7 @@ def _noise(
         / math.sqrt(12.0 * every)
         for each in read
     )
-    left, step_s = found.regression.residual(found.posterior.x), problem.signals[0].narrow.period_s
+    left, step_s = likeliest.regression.residual(likeliest.posterior.x), problem.signals[0].narrow.period_s
     at = np.arange(rows) * period_s / step_s
     torque = [
         np.interp(at % (len(mine) - 1), np.arange(len(mine)), mine)

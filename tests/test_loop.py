@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import signal
@@ -155,6 +156,21 @@ def test_an_effect_of_the_link_is_proposed_by_the_links_balance_and_the_motor_st
     before, after = jointfile.load_text(tmp_path / "elbow.toml").joint, jointfile.load(proposal_file(made))
     assert [one.name for one in after.link.effect] == ["link_coulomb_friction"]
     assert after.motor == before.motor
+
+
+def test_a_full_disk_is_a_line_of_the_diagnosis_too(tmp_path, monkeypatch, caplog):
+    def full(path: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    (made,) = touch(tmp_path, "081500Z-model-alarm")
+    monkeypatch.setattr(sys, "argv", ["diagnosing", str(made)])
+    for owner, name in ((os, "nice"), (os, "sched_setscheduler"), (signal, "signal")):
+        monkeypatch.setattr(owner, name, lambda *_: None)
+    monkeypatch.setattr(finding, "write_whole", full)
+    monkeypatch.setattr(diagnosing, "make", lambda recording: finding.write_page(recording, "page"))
+    assert diagnosing.main() == 3
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert said == f"elbow: {finding_file(made)}: cannot be written: No space left on device"
 
 
 def touch(folder: Path, *events: str) -> list[Path]:

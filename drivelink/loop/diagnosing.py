@@ -17,12 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drivelink import recording as recordings
-from drivelink.errors import DrivelinkError
-from drivelink.files import write_whole
+from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import JointFile, JointText, apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from drivelink.loop import finding
-from drivelink.loop.finding import page_file, proposal_file
+from drivelink.loop.finding import proposal_file
 from drivelink.output import report, sentences
 from drivelink.output.comparison import simulated
 from drivelink.output.numbers import Units
@@ -146,7 +145,7 @@ def make(recording: Path) -> dict[str, Any]:
             state = finding.PROPOSED
     runs = simulated(held, declared=model, found=apply_diagnosis.diagnosed_model(source.joint, change))
     title = report.Title(source.joint.name, recording.name, None, source.joint.axis == "linear")
-    write_whole(page_file(recording), report.html_page(outcome, title), force=True)
+    finding.write_page(recording, report.html_page(outcome, title))
     sentence = f"{said.sentence} Nothing is proposed: {harmful}." if harmful else said.sentence
     return {
         **finding.begun(recording, state, sentence),
@@ -233,7 +232,11 @@ def main() -> int:
         found = finding.begun(
             recording, finding.FAILED, f"not diagnosed: {error}: drivelink keep makes another recording"
         )
-    finding.write(recording, found)
+    try:
+        finding.write(recording, found)
+    except RecordingError as error:  # the disk is full
+        _LOG.error("%s: %s", found["joint"], error)
+        return error.exit_status
     _LOG.warning("%s: %s", found["joint"], found["sentence"])
     return 0
 

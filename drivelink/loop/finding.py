@@ -145,9 +145,21 @@ def write(recording: Path, finding: Mapping[str, Any]) -> None:
     Raises:
         RecordingError: it cannot be written.
     """
-    path = finding_file(recording)
+    _put(finding_file(recording), json.dumps(finding, indent=1, allow_nan=False) + "\n")
+
+
+def write_page(recording: Path, page: str) -> None:
+    """Write the page of a diagnosis beside its recording.
+
+    Raises:
+        RecordingError: it cannot be written.
+    """
+    _put(page_file(recording), page)
+
+
+def _put(path: Path, text: str) -> None:
     try:
-        write_whole(path, json.dumps(finding, indent=1, allow_nan=False) + "\n", force=True)
+        write_whole(path, text, force=True)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import signal
 import sys
 import threading
@@ -150,6 +151,19 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path, monkeypatch, 
     assert not scene.finish()
     assert [record.getMessage().count("No space left on device") for record in caplog.records] == [1]
     assert [path.name for path in (tmp_path / "kept").iterdir()] == ["elbow.day.csv"]
+
+
+def test_what_a_kill_leaves_is_removed_at_the_next_start(tmp_path, monkeypatch):
+    scene, left = Scene(tmp_path), tmp_path / "left"
+    scene.run(20)
+    scene.box.keep("asked")
+    monkeypatch.setattr(blackbox.McapSink, "note", lambda *_: shutil.copytree(tmp_path / "kept", left))
+    scene.finish()
+    names = [path.name for path in left.iterdir() if path.suffix != ".csv"]
+    assert len(names) == 1 and names[0].endswith("-asked.part")
+    (tmp_path / "kept" / names[0]).touch()
+    Scene(tmp_path)
+    assert not (tmp_path / "kept" / names[0]).exists()
 
 
 @pytest.mark.parametrize("is_full", [False, True])

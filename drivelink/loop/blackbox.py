@@ -229,6 +229,7 @@ class BlackBox(Sink):
         unfinished = path.with_suffix(UNFINISHED)
         try:
             sink = McapSink(unfinished, self._text.joint, self._text.text, force=True)
+            sink.flush()  # it has its name: what a kill leaves is found at the next start
             time_text = event.wall.isoformat(timespec="milliseconds")
             about = {"cause": event.cause, "causes": ", ".join(event.causes), "time": time_text}
             sink.note("black box", {**about, "joint_file": self._text.name})

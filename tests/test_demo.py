@@ -9,13 +9,14 @@ import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 from zenohkit import LIMIT_S, until
 
-from drivelink import cli
-from drivelink.demo.closedloop import STEPS
+from drivelink import cli, jointfile
+from drivelink.demo.closedloop import CASES, STEPS, ClosedLoop
 from drivelink.demo.closing import Comparison, as_json
 from drivelink.demo.closing import closing as closing_section
 from drivelink.demo.rig import RunSummary
@@ -25,6 +26,7 @@ from drivelink.output.document import show
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Status, TransmissionEstimate
 
+ELBOW = Path(__file__).parent.parent / "examples" / "elbow.toml"
 DEMO = [sys.executable, "-m", "drivelink", "demo"]
 
 
@@ -101,6 +103,16 @@ def test_the_demo_finds_the_stiffness_it_does_not_know(case):
     assert result["case"] == case
     assert result["stiffness_error_relative"] < 0.03
     assert result["flexibility_torque_error_relative"] < 0.03
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_breaks_what_is_said_between_words_and_a_file_not_at_all(terminal):
+    out, words = io.StringIO(), "on held-out data the error of the motor torque falls from 8.99 % to 0.52 %"
+    console, path = Console(file=out, force_terminal=terminal, width=40), ELBOW
+    case = CASES["friction"]
+    run = ClosedLoop(jointfile.load(path), path, case, console, live=False, yes=True, limit_s=1.0)
+    run._say(words)
+    assert " ".join(out.getvalue().split()) == words and (out.getvalue().count("\n") > 1) is terminal
 
 
 @pytest.mark.slow

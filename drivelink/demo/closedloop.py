@@ -169,7 +169,7 @@ class ClosedLoop(DemoRun):
         self._say(f"{since_s:6.1f} s  {text}", "bold")
 
     def _say(self, line: str, style: str = "") -> None:
-        self._console.print(Text(line, style=style), soft_wrap=True)
+        self._console.print(Text(line, style=style), soft_wrap=not self._console.is_terminal)
 
 
 def found_values(report: Mapping[str, Any]) -> dict[str, tuple[float, float]]:

@@ -18,7 +18,7 @@ from drivelink.jointfile.apply_diagnosis import as_read, diagnosed_model, floor_
 from drivelink.output import fitreport, plots, report, sentences
 from drivelink.output import motion as motions
 from drivelink.output.comparison import beside, fits, simulated
-from drivelink.output.document import Section, write
+from drivelink.output.document import Section, as_text, write
 from drivelink.output.numbers import Units
 from drivelink.recording.columns import parse_column_map
 from drivelink.recording.corrections import gate
@@ -95,6 +95,9 @@ class Fit:
     runs: Runs
     found: Identified
     bandwidth_rad_s: float | None = None
+
+    def __repr__(self) -> str:
+        return as_text(fitreport.sections(self.found, (), (), self.runs.units))
 
     def predict(self, other: str | Path, horizon_s: float | None = None) -> FreeRun:
         """Simulate the fitted model under the motor torque of another recording (or of the same).
@@ -208,7 +211,7 @@ class Diagnosed:
     held: Record | None = None  # its values
     motion: NextMotion | None = None  # the one to record next, if it was asked for
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return sentences.sentence(self.outcome)
 
     @property

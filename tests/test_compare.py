@@ -45,6 +45,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_two_machines_differ_in_the_stiffness_and_each_model_fits_its_own(runs):
     made = compare(runs / "healthy.csv", runs / "soft.csv", ELBOW, horizon_s=1.0)
     stiffness, friction = made.differences()
+    assert "where they differ most" in repr(made) and len(repr(made)) < 5000
     assert abs(stiffness.b / stiffness.a - 0.9) < 0.02
     assert abs(stiffness.b - stiffness.a) > 10.0 * stiffness.std > 0.0
     assert abs(friction.b - friction.a) < 5.0 * friction.std
@@ -176,6 +177,7 @@ def test_what_cannot_be_simulated_is_one_line_and_the_fit_figure_is_that_of_matl
 def test_three_lines_fit_predict_plot_and_write(fleet, tmp_path):
     run, other = (fleet / "recordings" / f"elbow-2026-01-0{day}.csv" for day in (5, 6))
     fit = drivelink.fit(run, joint=fleet / "joints" / "elbow.toml")
+    assert "motor 1: polynomial" in repr(fit) and "coefficients_nm_rad" in str(fit)
     assert min(fit.predict(other, 0.05).fit_percent.values()) > 80.0
     assert fit.plot()._repr_png_().startswith(b"\x89PNG")
     better = fit.write(tmp_path / "better.toml")
@@ -183,6 +185,6 @@ def test_three_lines_fit_predict_plot_and_write(fleet, tmp_path):
     with pytest.raises(DrivelinkError, match="exists"):
         fit.write(better)
     found = drivelink.diagnose(other, joint=better)
-    assert str(found).startswith("The model is sufficient")
+    assert repr(found) == str(found) and str(found).startswith("The model is sufficient")
     assert found.plot()._repr_png_().startswith(b"\x89PNG")
     assert [path.name for path in found.report(tmp_path)] == ["report.json", "report.html"]

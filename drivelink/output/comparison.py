@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drivelink.output import plots
-from drivelink.output.document import Chart, Document, Grid, Paragraph, Rows, Section
+from drivelink.output.document import Chart, Document, Grid, Paragraph, Rows, Section, as_text
 from drivelink.output.numbers import Units, number, value_and_interval
 from estimator.choices import choice
 from estimator.comparison import Correlation, Curve, correlations, friction_curve, stiffness_curve
@@ -61,6 +61,9 @@ class Comparison:
     sides: tuple[Side, Side]
     runs: tuple[tuple[Side, FreeRun, FreeRun], ...]
     units: Units
+
+    def __repr__(self) -> str:
+        return as_text(self.sections())
 
     def residuals(self, side: Side, run: FreeRun) -> tuple[Correlation, Correlation]:
         """Return the correlations of the residual of one free run: that of the first motor's last channel."""

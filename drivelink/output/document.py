@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html as markup
+import io
 import json
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
@@ -21,6 +22,7 @@ from drivelink.output.numbers import Units
 from drivelink.plaintext import spelt
 from estimator.model import ParameterValue
 
+_WIDTH = 100  # columns of a result in Python
 _NARROWEST = 12  # columns of the names beside cells that are not folded
 PARAMETER_HEAD = ("parameter", "value", "± (95 %)", "unit")
 
@@ -112,6 +114,13 @@ def show(sections: Iterable[Section], console: Console) -> None:
             elif isinstance(block, Lines):
                 for line in block.lines:
                     console.print(Text(f"  {line}"), soft_wrap=True)
+
+
+def as_text(sections: Iterable[Section]) -> str:
+    """Return what `show` prints: a result of Python that is looked at."""
+    text = io.StringIO()
+    show(sections, Console(file=text, width=_WIDTH))
+    return text.getvalue().strip()
 
 
 def _printed(grid: Grid, title: str, console: Console) -> Table:

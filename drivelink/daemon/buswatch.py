@@ -137,8 +137,8 @@ class BusWatch:
             ]
             self._events.begin(
                 "too slow",
-                f"this machine is too slow for the cycle of {loop.period_ns / 1e6:g} ms: "
-                f"{', '.join(filter(None, counted))}; drivelink doctor names the cause",
+                f"this machine is too slow for the cycle of {loop.period_ns / 1e6:g} ms "
+                f"(drivelink doctor says why): {', '.join(filter(None, counted))}",
             )
         elif now - self._slow_ns > _NS:
             self._slow = total  # the count restarts with a reopened bus

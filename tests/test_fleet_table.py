@@ -230,18 +230,26 @@ def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_cha
 
 CUT = "[...document.querySelectorAll('figure, .table')].filter(e => e.scrollWidth > e.clientWidth).length"
 
+SHOWN = """[...document.querySelectorAll('.joints tr')].filter(row => row.offsetHeight)
+.sort((a, b) => a.offsetTop - b.offsetTop).map(row => row.querySelector('th').textContent)"""
+
 
 @pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
-def test_a_phone_shows_charts_and_tables_whole(tmp_path):
+def test_a_phone_shows_charts_and_tables_whole_and_joints_are_sorted_and_hidden(tmp_path):
     rows = [
-        night("elbow", k, 150.0 + 4.0 * (k >= 12), ["coulomb_friction@motor"] if k >= 9 else [])
+        night("wrist", k, 150.0 + 4.0 * (k >= 12), ["coulomb_friction@motor"] if k >= 9 else [])
         for k in range(20)
-    ]
+    ] + [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(20)]
     (tmp_path / "fleet.html").write_text(page(summarise(rows, 0.05)), encoding="utf-8")
     with chromium.Chromium(tmp_path / "profile") as browser:
         browser.resize(390, 800)
         browser.open((tmp_path / "fleet.html").as_uri())
         assert browser.evaluate(CUT) == 0
+        assert browser.evaluate(SHOWN) == ["wrist", "elbow"]  # by urgency
+        browser.evaluate("document.getElementById('by1').click()")
+        assert browser.evaluate(SHOWN) == ["elbow", "wrist"]  # by name
+        browser.evaluate("document.getElementById('show-steady').click()")
+        assert browser.evaluate(SHOWN) == ["wrist"]
 
 
 def test_the_examples_of_the_documentation_read_the_table(tmp_path, monkeypatch, capsys):

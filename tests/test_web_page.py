@@ -85,17 +85,20 @@ def test_undo_stays_on_the_page_when_a_newer_finding_has_come():
 
 
 def test_the_pointer_reads_the_curve_at_its_place():
-    text, moment, hidden = page(
+    text, moment, hidden, left = page(
         SPAN
         + """
         const m = joints.elbow.moments.at(-50), now = joints.elbow.moments.at(-1)[0];
         hover("torqueplot", X(m[0] - now), Y(m[1]));
         const text = $("tip").textContent;
+        $("tip").offsetWidth = 300; innerWidth = 390;  // a phone, and the end of a curve
+        hover("torqueplot", X(m[0] - now), Y(m[1]));
         $("torqueplot").onmouseleave();
-        return [text, [number(m[0] - now, 3), number(m[1])], $("tip").hidden];
+        return [text, [number(m[0] - now, 3), number(m[1])], $("tip").hidden, parseFloat($("tip").style.left)];
         """,
         fed(),
     )
+    assert 4.0 <= left <= 390 - 300 - 4  # the tooltip stays inside the window
     assert text == f"time {moment[0]} s\n{moment[1]} N·m" and hidden is True
 
 

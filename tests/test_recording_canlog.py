@@ -2,6 +2,7 @@
 
 import logging
 import random
+from io import BytesIO
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +13,7 @@ from drivelink.jointfile import parse
 from drivelink.recording.canlog import CAN_FORMATS, NO_STAMP, LoggedFrame, read_frames
 from drivelink.recording.cycles import Assembly, SyncNumbering, numbered_ahead, numbered_at_once
 from drivelink.recording.formats import open_sink
+from drivelink.recording.limits import AscText
 from estimator.sample import Sample
 
 JOINT = parse('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[bus]\nchannel = "can0"\n')
@@ -176,3 +178,8 @@ def test_a_sample_that_the_next_sync_completes_has_the_stamp_of_its_own():
     assembly.follower, assembly._recent = SimpleNamespace(feed=lambda *_: None), RecentSamples(1e-3)
     assembly._period_s = 1e-3
     assert [cycle.stamp_ns for cycle in assembly.cycles(syncs([1e-4, 2e-4]), 1)] == [100]
+
+
+def test_empty_lines_of_an_asc_file_are_not_looked_at(tmp_path):
+    text = AscText(BytesIO(b"\n" * 1000 + b" \r\ndate\n\n"), tmp_path / "r.asc")
+    assert [text.readline(), text.readline()] == ["date\n", ""]

@@ -129,7 +129,11 @@ class MapFollower:
 
 
 class PassiveFollower(MapFollower):
-    """Uses the nodes of another master, while their mappings are trusted."""
+    """Uses the nodes of another master, while their mappings are trusted.
+
+    Args:
+        clock_may_be_set: a gap between SYNCs need not be silence, as in a log, which has one clock only.
+    """
 
     def __init__(
         self,
@@ -137,8 +141,10 @@ class PassiveFollower(MapFollower):
         assemblers: Mapping[int, Assembler],
         layouts: Mapping[int, NodeLayout],
         used: Used = lambda _node, _layout: None,
+        clock_may_be_set: bool = False,
     ) -> None:
         super().__init__(configurator, assemblers, layouts, used)
+        self._clock_may_be_set = clock_may_be_set
         self._listener = configurator
         self._silent = max(2 * _LOOKS, round(_SILENT_S / configurator.bus.period_s))  # SYNCs
         self._heard = dict.fromkeys(assemblers, (0, 0))  # frames of a node, and the SYNC of the last one
@@ -197,7 +203,7 @@ class PassiveFollower(MapFollower):
             counters, (frames, last) = assembler.counters[node], self._heard[node]
             received = counters.received + counters.ignored
             if gap := number - before >= self._silent:  # no SYNC either; one frame may be as old as the last
-                heard = self._since_sync[node] > 1
+                heard = self._clock_may_be_set or self._since_sync[node] > 1
             else:
                 heard = node in self._speaking or received != frames
             if not heard and (gap or number - last >= max(self._silent, 3 * _slowest(self._in_use[node]))):
@@ -238,7 +244,7 @@ def follow_log(configurator: PassiveConfigurator, assembler: Assembler, recent: 
     layouts, section = configurator.layouts, configurator.bus
     assemblers = dict.fromkeys(layouts, assembler)
     if not section.configure:
-        return PassiveFollower(configurator, assemblers, layouts)
+        return PassiveFollower(configurator, assemblers, layouts, clock_may_be_set=True)
     samples = dict.fromkeys(layouts, recent.after)
     check = ObjectCheck(section.sdo_timeout_s, samples) if section.read_back_s else None
     return MapFollower(configurator, assemblers, layouts, check=check)

@@ -137,7 +137,8 @@ class AscText(io.TextIOBase):
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         super().__init__()
-        self._lines = whole_lines(file, path)
+        # A megabyte of empty lines costs python-can more than a second.
+        self._lines = (line for line in whole_lines(file, path) if not line.isspace())
         self._relative = False
         self._total = 0.0
 

@@ -28,7 +28,7 @@ from drivelink.loop import blackbox
 from drivelink.loop.blackbox import AFTER_S, BlackBox
 from drivelink.loop.finding import drop_oldest, event_of, kept
 from drivelink.pubsub.feed import DECODERS
-from drivelink.pubsub.wire import EstimateMessage
+from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, read_messages, recorded_cycles
 from drivelink.recording.messages import estimate_encoder
@@ -137,6 +137,16 @@ def test_events_of_the_status_are_kept(status, cause, tmp_path):
         scene.box.document("status", json.dumps(status).encode(), 1)
     scene.run(20)
     assert [made[1] for made in scene.finish()] == [cause]
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_contact_is_kept_where_that_is_asked_for(asked, tmp_path):
+    scene = Scene(tmp_path, "keep_contacts = true\n" if asked else "")
+    scene.run(20)
+    for _ in range(3):
+        scene.box.external(ExternalMessage(1, 1, 3, 2.0, 0.1))
+    scene.run(20)
+    assert [cause for _, cause in scene.finish()] == ["contact"] * asked
 
 
 def full(*_: object) -> int:

@@ -25,6 +25,7 @@ from estimator.diagnosis import diagnose
 from estimator.freerun import free_run
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+import motion
 from world import simulate
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
@@ -209,3 +210,10 @@ def test_a_polynomial_of_open_order_follows_any_spring():
     record = simulated(f"spring=exponential exponent=15 {settings}").record
     found = diagnose(record, declared(settings, model="polynomial", parameters={}))
     assert found.verdict == "sufficient" and found.transmissions[0].parameters
+
+
+def test_a_late_reading_that_no_effect_stands_in_for_is_diagnosed():
+    joint = motion.joint_of(motion.CASES["late link"], 54)
+    moved = joint.moved(12.0, 54, **motion.MOTIONS[2]).record
+    outcome = diagnose(moved, joint.model)
+    assert [one.name for one in outcome.effects] == ["encoder_delay"]

@@ -87,7 +87,11 @@ def _late(search: Search, found: Fitted, std: FloatArray) -> list[Finding]:
         key = slot.name, slot.motor
         each = search.children(problem.with_declared(found, key))
         instead = accounts(search.held, next((h for h in each if key in h.keys), found), each)
-        others = [(weight, one.terms[-1].candidate) for weight, one in instead if key not in one.keys]
+        others = [
+            (weight, one.terms[-1].candidate)
+            for weight, one in instead
+            if key not in one.keys and one is not found
+        ]
         listed = [(weight, c.kind.name) for weight, c in others if weight > choice("even")]
         made.append(Finding(
             name=slot.name, location=LIBRARY[slot.name].location, motor=slot.motor,

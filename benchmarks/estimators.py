@@ -91,6 +91,8 @@ def effects(rng: np.random.Generator, rated: float, stiffness: float) -> dict[st
         "nothing": {},
         "link 1 period late": {"link_delay": T},
         "link 3 periods late": {"link_delay": 3 * T},
+        "torque sampled, not held": {"torque_delay": 0.5 * T},
+        "torque 3 periods late": {"torque_delay": 3 * T},
         "Coulomb friction": {"friction": "coulomb", "coulomb": torque},
         "Stribeck friction": {"friction": "stribeck", **friction},
         "LuGre friction": {"friction": "lugre", **friction},

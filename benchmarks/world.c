@@ -27,7 +27,7 @@ static double link_inertia = 0.45, link_damping = 0.5, gravity = 3;
 static double friction, coulomb = 0.3, stribeck = 0.5, stribeck_velocity = 0.05, bristle = 2e-3, bristle_damping = 0.3;
 static double gear_loss, hysteresis, hysteresis_torque = 0.3, hysteresis_width = 4e-3, backlash, rounding = 0.25;
 static double transmission_damping, cogging, cogging_periods = 32, link_delay, motor_counts = 8192, link_bits = 17;
-static double torque_noise, motion, size = 7, top_hz = 3, push = 5, pull, seconds = 30, period = 1e-3, seed = 1;
+static double torque_delay, torque_noise, motion, size = 7, top_hz = 3, push = 5, pull, seconds = 30, period = 1e-3, seed = 1;
 
 static const struct setting {
     const char *name;
@@ -62,6 +62,7 @@ static const struct setting {
     {"link_delay", &link_delay, 0, "of the link encoder, s, in steps of period/20"},
     {"motor_counts", &motor_counts, 0, "per turn of the joint; 0: exact"},
     {"link_bits", &link_bits, 0, "2^bits per turn of the joint; 0: exact"},
+    {"torque_delay", &torque_delay, 0, "of the reported torque, s: half a period where it is sampled and not held"},
     {"torque_noise", &torque_noise, 0, "standard deviation, N·m"},
     {"motion", &motion, "multisine point-to-point hand-guided pushes harmonic played", "what moves the joint"},
     {"size", &size, 0, "amplitude of the motor's torque, N·m; point-to-point: largest step, rad"},
@@ -199,6 +200,15 @@ static double sum_sines(const struct sines *s, double t) {
 static struct sines driven, guided;
 static double from, target, move_start, move_time, push_start, push_time, push_torque;
 
+/* What the drive reports of the torque: between those of earlier periods. */
+static double reported(double motor, long k) {
+    static double earlier[LONGEST_DELAY];
+    double late = torque_delay / period, whole = floor(late);
+    earlier[k % LONGEST_DELAY] = motor;
+    long from = k - (long)whole < 0 ? 0 : k - (long)whole, before = from > 0 ? from - 1 : 0;
+    return earlier[from % LONGEST_DELAY] * (1 - late + whole) + earlier[before % LONGEST_DELAY] * (late - whole);
+}
+
 /* A drive's position loop along quintic moves with rests between. */
 static double point_to_point(const double *x, double t) {
     if (t >= move_start + move_time + 0.4) {
@@ -251,8 +261,9 @@ int main(int count, char **arguments) {
     for (int i = 1; i < count; i++) set(arguments[i]);
     double h = period / SUBSTEPS, x[STATES] = {0};
     long late = lround(link_delay / h), step = 0;
-    if (!(h > 0) || !(inertia > 0) || !(link_inertia > 0) || late >= LONGEST_DELAY)
-        return fputs("period, inertia, link_inertia: above 0; link_delay: below 50 periods\n", stderr), 2;
+    if (!(h > 0) || !(inertia > 0) || !(link_inertia > 0) || late >= LONGEST_DELAY ||
+        torque_delay > 50 * period)
+        return fputs("period, inertia, link_inertia: above 0; delays: below 50 periods\n", stderr), 2;
     state = (uint64_t)seed * 0x2545F4914F6CDD1Du;
     draw_sines(&driven, 0.2, top_hz), draw_sines(&guided, 0.15, 1.5);
     puts("time_s,motor1_position_rad,motor1_torque_nm,link_position_rad,"
@@ -264,7 +275,7 @@ int main(int count, char **arguments) {
         link[step % LONGEST_DELAY] = x[2];
         double seen = link[(step >= late ? step - late : 0) % LONGEST_DELAY];
         printf("%.6f,%.12g,%.12g,%.12g,%.12g,%.12g,%.12g,%.12g\n", t, read_encoder(x[0], motor_counts),
-               motor + (torque_noise ? torque_noise * normal() : 0), read_encoder(seen, link_bits ? exp2(link_bits) : 0),
+               reported(motor, k) + (torque_noise ? torque_noise * normal() : 0), read_encoder(seen, link_bits ? exp2(link_bits) : 0),
                slope, torque, spring_only, external);
         for (int i = 0; i < SUBSTEPS; i++) {
             advance(x, motor, external_torque(t + i * h), h);

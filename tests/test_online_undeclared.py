@@ -1,5 +1,7 @@
 """What nobody declared: a held motor's friction, springs that bend, a shape that the motion does not show."""
 
+from dataclasses import replace
+
 import heldmotor
 import joints
 import numpy as np
@@ -60,3 +62,19 @@ def test_a_spring_of_another_stiffness_on_either_side_is_named_and_right():
     assert np.mean(out[:, 1].astype(int) & kit.VALID > 0) > 0.99
     assert np.sqrt(np.mean((out[:, 2] - torque) ** 2)) < 0.02 * np.sqrt(np.mean(torque**2))
     assert np.median(np.abs(out[:, 3] / truth.sigma[-6000:, 0, 0] - 1.0)) < 0.005
+
+
+@pytest.mark.parametrize(("periods", "names"), [(0.5, []), (3.0, ["torque_delay"])])
+def test_a_torque_that_is_read_late_is_no_other_effect(periods, names):
+    plants = joints.Plants(*joints.polynomial(np.array([150.0, 8000.0])), 0.12, 0.8, 0.45, 0.3, 3.0)
+    truth = joints.simulate(plants, joints.sweep(np.random.default_rng(4), 12000, 1, 1, T, 8.0, 3.0), T)
+    noise = np.random.default_rng(5).normal(0.0, 0.02, (12000, 1))
+    read = joints.record(truth, 0, T, motor_counts=8192, link_bits=17, torque_noise=noise)
+    moments = np.arange(len(read.sequence))
+    torque = np.interp(moments - periods, moments, read.motor_torque_nm[:, 0])[:, None]
+    joint = joints.joint_model(0.12, 0.8, model="polynomial", order=2, parameters={})
+    estimates, estimator = kit.play(joint, replace(read, motor_torque_nm=torque).samples())
+    off = np.abs(estimates.stiffness_nm_rad / truth.sigma[:, 0, 0] - 1.0)[-4000:]
+    assert estimator.undeclared()[0] == names
+    assert np.mean(estimates.valid[-4000:]) > 0.99
+    assert np.max(off) < 0.01

@@ -93,6 +93,8 @@ impl<const N: usize, const L: usize> Lanes<N, L> {
 pub struct Balance {
     /// What the columns are scaled by; zero before there was motion.
     pub size: Size,
+    /// By how much the torque is read late, s: it is brought up by its derivatives.
+    pub late: f64,
     family: Family,
     position: Channel,
     torque: Channel,
@@ -113,6 +115,7 @@ impl Balance {
     pub fn new(family: Family) -> Balance {
         Balance {
             size: Size::default(),
+            late: 0.0,
             family,
             position: Channel::rest(0.0),
             torque: Channel::rest(0.0),
@@ -301,8 +304,8 @@ impl Balance {
     #[must_use]
     pub fn row(&self, link: &Channel) -> Row {
         let mut row: Row = [0.0; COLUMNS];
-        row[TORQUE] = self.torque.main[0] - self.effects.main[0];
-        row[TORQUE_RATE] = self.torque.main[1];
+        let [torque, rate] = self.torque();
+        (row[TORQUE], row[TORQUE_RATE]) = (torque - self.effects.main[0], rate);
         row[ACCELERATION] = self.position.main[2];
         row[VELOCITY] = self.position.main[1];
         row[OFFSET] = 1.0;
@@ -363,10 +366,18 @@ impl Balance {
         self.position.main[3]
     }
 
-    /// Filtered θ and τ, their derivatives, and the filtered declared effects.
+    /// Filtered τ and its rate, where they act.
     #[must_use]
-    pub fn filtered(&self) -> (&[f64; 4], &[f64; 4], &[f64; 4]) {
-        (&self.position.main, &self.torque.main, &self.effects.main)
+    pub fn torque(&self) -> [f64; 2] {
+        let [value, first, second, third] = self.torque.main;
+        let s = self.late;
+        [value + s * (first + s / 2.0 * (second + s / 3.0 * third)), first + s * (second + s / 2.0 * third)]
+    }
+
+    /// Filtered θ and the filtered declared effects, with their derivatives.
+    #[must_use]
+    pub fn filtered(&self) -> (&[f64; 4], &[f64; 4]) {
+        (&self.position.main, &self.effects.main)
     }
 
     /// Lightly filtered θ and its derivatives.
@@ -375,10 +386,10 @@ impl Balance {
         &self.position.light
     }
 
-    /// Lightly filtered τ, N·m.
+    /// Lightly filtered τ and its derivatives.
     #[must_use]
-    pub fn light_torque(&self) -> f64 {
-        self.torque.light[0]
+    pub fn light_torque(&self) -> &[f64; 3] {
+        &self.torque.light
     }
 }
 

@@ -17,7 +17,7 @@ pub const COLUMNS: usize = 32;
 pub type Row = [f64; COLUMNS];
 
 /// Unknowns of a balance, with index 0 for what they explain.
-pub const UNKNOWNS: usize = 26;
+pub const UNKNOWNS: usize = 27;
 
 /// One value an unknown.
 pub type Vector = [f64; UNKNOWNS];

@@ -212,7 +212,7 @@ impl Robust {
 
     /// Effects of one motor that nobody declared and evidence chose.
     pub fn undeclared(&self, motor: usize) -> impl Iterator<Item = &'static str> {
-        self.sides[motor].blocks.undeclared()
+        self.sides[motor].undeclared()
     }
 
     /// Parameters of one motor's transmission and their standard deviations; the law they belong to.

@@ -36,6 +36,8 @@ pub struct Moment<'a> {
 pub enum Shift {
     /// The link is so many periods late.
     Late(f64),
+    /// The torque is so many periods later than was assumed.
+    TorqueLate(f64),
     /// The zero is at this deflection, rad.
     Zero(f64),
     /// The zero is not where it was.
@@ -227,7 +229,9 @@ impl Side {
         self.followed_s -= self.period;
         self.held_s += self.period;
         if !self.rigid {
-            self.deflection.update(theta, phi, last.torque[i] + self.acting - self.effect);
+            let late_s = self.balance.late + self.blocks.torque_lateness().0;
+            let late = last.torque[i] + late_s * self.balance.light_torque()[1];
+            self.deflection.update(theta, phi, late + self.acting - self.effect);
             self.balance.observe(phi, usable && can_be);
         }
     }
@@ -250,7 +254,7 @@ impl Side {
             deflection_rate: link.light[1] - light[1],
             flexibility_torque,
             stiffness,
-            torque: self.balance.light_torque(),
+            torque: self.balance.light_torque()[0],
             time,
             ..Coordinates::default()
         };
@@ -321,11 +325,30 @@ impl Side {
         if off != 0.0 {
             return Some(Shift::Zero(off));
         }
-        let known = !self.doubtful && !self.blocks.is_lost(); // a zero that is elsewhere looks late
-        let (late, std) = self.blocks.delay().filter(|_| known)?;
-        let (periods, std) = (late / self.period, std / self.period);
-        let late = periods.abs() - 0.5 > SURE * std;
-        late.then(|| Shift::Late(periods.round()))
+        if self.doubtful || self.blocks.is_lost() {
+            return None; // a zero that is elsewhere looks late
+        }
+        let periods = |(late, std): (f64, f64)| {
+            let beyond = late.abs() - 0.5 * self.period > SURE * std;
+            beyond.then(|| (late / self.period).round())
+        };
+        let link = self.blocks.delay().and_then(periods).map(Shift::Late);
+        link.or_else(|| periods(self.blocks.torque_lateness()).map(Shift::TorqueLate))
+    }
+
+    /// Names of the effects that nobody declared. A drive that samples or averages its torque is a period late.
+    pub fn undeclared(&self) -> impl Iterator<Item = &'static str> {
+        let late = self.balance.late.abs() > self.period;
+        self.blocks.undeclared().chain(late.then_some("torque_delay"))
+    }
+
+    /// The torque is read so many periods later than was assumed, if a filter of this bandwidth can bring it up.
+    pub fn shift_torque(&mut self, periods: f64, bandwidth_rad_s: f64, theta: f64, phi: f64) {
+        let late = self.balance.late + periods * self.period;
+        if late.abs() * bandwidth_rad_s < 1.0 {
+            self.balance.late = late;
+            self.relearn(theta, phi);
+        }
     }
 
     /// What the blocks say of themselves, at their ends.
@@ -352,7 +375,7 @@ impl Side {
 
     /// What the motor's balance leaves as the transmission's torque (eq 14), brought up by its slope.
     fn balance_torque(&self, ahead_s: f64) -> f64 {
-        let (motor, tau, x) = self.balance.filtered();
+        let ((motor, x), tau) = (self.balance.filtered(), self.balance.torque());
         let value = self.inertia * motor[2] + self.damping * motor[1] + x[0] - tau[0];
         let rate = self.inertia * motor[3] + self.damping * motor[2] + x[1] - tau[1];
         value + ahead_s * rate

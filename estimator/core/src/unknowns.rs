@@ -29,23 +29,25 @@ pub const SPRING: std::ops::Range<usize> = 5..5 + TERMS;
 pub const ZERO: usize = 10;
 /// By how much the link position is later than was assumed, s.
 pub const LATE: usize = 11;
+/// By how much the torque is later than was assumed, s.
+pub const TORQUE_LATE: usize = 12;
 /// Friction that grows with speed before it is full, N·m.
-pub const SOFT: usize = 12;
+pub const SOFT: usize = 13;
 /// Friction that grows with the load, N·m at the largest deflection.
-pub const LOAD: std::ops::Range<usize> = 13..15;
+pub const LOAD: std::ops::Range<usize> = 14..16;
 /// Damping of the transmission, N·m·s/rad.
-pub const RATE: usize = 15;
+pub const RATE: usize = 16;
 /// Memory of the transmission, N·m at half the range.
-pub const STOPS: std::ops::Range<usize> = 16..19;
+pub const STOPS: std::ops::Range<usize> = 17..20;
 /// A spring of any shape, N·m at half the range.
-pub const CLIPS: std::ops::Range<usize> = 19..23;
+pub const CLIPS: std::ops::Range<usize> = 20..24;
 /// A corner of the stiffness at zero, N·m at the largest deflection.
-pub const CORNER: std::ops::Range<usize> = 23..24;
+pub const CORNER: std::ops::Range<usize> = 24..25;
 /// A spring that is stiffer to one side: of |φ|, N·m at the largest deflection, and of φ², N·m/rad².
-pub const ASYMMETRY: std::ops::Range<usize> = 24..26;
+pub const ASYMMETRY: std::ops::Range<usize> = 25..27;
 
 /// Those that every joint has.
-pub const ACTIVE: Set = (1 << SOFT) - 2;
+pub const ACTIVE: Set = (1 << TORQUE_LATE) - 2;
 
 const USUAL: usize = 2; // powers that springs of which nothing is declared have
 const SHAPES: usize = 12; // of a law that are tried before any is known
@@ -61,7 +63,8 @@ pub struct Candidate {
 }
 
 /// The groups of unknowns that evidence chooses.
-pub const CANDIDATES: [Candidate; 6] = [
+pub const CANDIDATES: [Candidate; 7] = [
+    Candidate { unknowns: TORQUE_LATE..SOFT, name: "torque_delay" },
     Candidate { unknowns: SOFT..SOFT + 1, name: "stribeck_friction" },
     Candidate { unknowns: LOAD, name: "load_dependent_friction" },
     Candidate { unknowns: RATE..RATE + 1, name: "transmission_damping" },
@@ -328,6 +331,7 @@ impl Spring {
         for (phi, row) in nodes.iter().zip(&mut rows) {
             self.law.jacobian(phi + self.zero, alpha, &mut row[..self.size]);
         }
+        frame.directions[TORQUE_LATE][balance::TORQUE_RATE] = -1.0;
         for (i, unknown) in SPRING.enumerate().take(self.size) {
             let column: [f64; NODES] = std::array::from_fn(|k| rows[k][i]);
             place(&mut frame.directions[unknown], &projection.fit(&column), 1.0);

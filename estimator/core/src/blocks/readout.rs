@@ -4,7 +4,7 @@ use super::Blocks;
 use crate::balance::Balance;
 use crate::choices::{BLOCKS, UNUSUAL, USEFUL};
 use crate::gram::{UNKNOWNS, set};
-use crate::unknowns::{CANDIDATES, LATE, OFFSET, RATE, Reading};
+use crate::unknowns::{CANDIDATES, LATE, OFFSET, RATE, Reading, SOFT, TORQUE_LATE};
 
 impl Blocks {
     /// Delay of the link position, s, and its standard deviation.
@@ -19,6 +19,15 @@ impl Blocks {
     #[must_use]
     pub fn lateness(&self) -> (f64, f64) {
         self.delay().unwrap_or((0.0, self.priors.encoder_delay * self.period))
+    }
+
+    /// By how much the torque is later than was assumed, s, and its standard deviation.
+    #[must_use]
+    pub fn torque_lateness(&self) -> (f64, f64) {
+        let known = self.posterior.as_ref().filter(|known| known.set >> TORQUE_LATE & 1 == 1);
+        known.map_or((0.0, 0.0), |known| {
+            (known.x[TORQUE_LATE], known.covariance[TORQUE_LATE][TORQUE_LATE].sqrt())
+        })
     }
 
     /// Torque and stiffness at a deflection, with their slopes by the unknowns; `None`: nothing is known.
@@ -74,9 +83,9 @@ impl Blocks {
         if self.posterior.is_some() { self.quick.sqrt() } else { f64::NAN }
     }
 
-    /// Names of the effects that nobody declared and evidence chose.
+    /// Names of the effects that nobody declared and evidence chose; a torque that is late by a part of a period is none.
     pub fn undeclared(&self) -> impl Iterator<Item = &'static str> {
-        let chosen = self.posterior.as_ref().map_or(0, |posterior| posterior.set);
+        let chosen = self.posterior.as_ref().map_or(0, |posterior| posterior.set & !set(TORQUE_LATE..SOFT));
         let named = CANDIDATES.iter().filter(move |c| chosen & set(c.unknowns.clone()) != 0).map(|c| c.name);
         let longer = self.spring.is_longer(chosen).then_some("higher_order_stiffness");
         named.chain(longer).chain(self.moved.then_some("deflection_offset"))

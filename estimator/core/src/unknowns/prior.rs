@@ -1,6 +1,8 @@
 //! What is believed of the unknowns before any data.
 
-use super::{CORNER, DAMPING, DRY, INERTIA, LATE, LOAD, OFFSET, SOFT, SPRING, Scale, Spring, USUAL, ZERO};
+use super::{
+    CORNER, DAMPING, DRY, INERTIA, LATE, LOAD, OFFSET, SOFT, SPRING, Scale, Spring, TORQUE_LATE, USUAL, ZERO,
+};
 use crate::balance;
 use crate::gram::{Frame, Gram, Prior, UNKNOWNS, inverse, set};
 use crate::model::Motor;
@@ -54,6 +56,7 @@ impl Spring {
         }
         (mean[ZERO], std[ZERO]) = (-self.zero, zero_std);
         std[LATE] = priors.encoder_delay * period_s;
+        std[TORQUE_LATE] = period_s;
         self.with_declared(Prior::independent(mean, &std))
     }
 

@@ -360,12 +360,6 @@ impl Balance {
         self.position.main[1]
     }
 
-    /// Filtered θ‴, rad/s³.
-    #[must_use]
-    pub fn jerk(&self) -> f64 {
-        self.position.main[3]
-    }
-
     /// Filtered τ and its rate, where they act.
     #[must_use]
     pub fn torque(&self) -> [f64; 2] {
@@ -398,13 +392,6 @@ impl Balance {
 pub fn variance(gram: &Gram, column: usize) -> f64 {
     let mean = gram.at(column, OFFSET) / gram.rows;
     (gram.rms(column).powi(2) - mean * mean).max(0.0)
-}
-
-/// Rows that the filters make of one independent error: the length of their impulse response over a period.
-#[must_use]
-pub fn correlated_rows(main: &StateVariableFilter<4>, period_s: f64) -> f64 {
-    // White noise through w⁴/(s + w)⁴ has the correlation time 2 ∫ρ dt = 32/(5 w).
-    (6.4 / (main.bandwidth * period_s)).max(1.0)
 }
 
 #[cfg(test)]

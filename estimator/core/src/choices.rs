@@ -66,7 +66,7 @@ choices! {
     FLOOR: f64 = 0.002, "torque", "error that no declared model gets below", "the same, and parameters as they are written";
     EARLY: f64 = 0.005, "torque", "noise of rows before any has shown it", "drives know their torque to this";
     TAILS: f64 = 8.0, "degrees of freedom", "of a block's noise", "it varies within a factor of two";
-    UNLIKE: f64 = 0.05, "torque of friction and memory", "error of their laws that nobody declared", "no joint's are quite of our shapes";
+    UNLIKE: f64 = 0.05, "torque of friction, memory and free curve", "error of their laws that nobody declared", "no joint's are quite of our shapes";
     ALIKE: f64 = 0.3, "", "share of a missing effect's errors that all blocks have", "0 is noise, 1 one motion again and again";
     LINK_FLOOR: f64 = 0.001, "torque carried", "error of the curve when the link is identified", "no curve is known better";
     USEFUL: f64 = 0.2, "torque", "left at most by a curve that is used", "a spring carries most of what it explains";

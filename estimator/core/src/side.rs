@@ -5,7 +5,7 @@ mod estimate;
 use serde::{Deserialize, Serialize};
 
 use crate::align::Inputs;
-use crate::balance::{Balance, correlated_rows};
+use crate::balance::Balance;
 use crate::blocks::{Blocks, Closed, Readings};
 use crate::choices::{AHEAD_S, GROWN, REACHED, SAID_S, SETTLED, SURE};
 use crate::deflection::{AT_REST, DeflectionFilter, Motion, Tuning};
@@ -88,7 +88,7 @@ impl Side {
         look_s: f64,
         alarms_per_hour: f64,
     ) -> Side {
-        let rows = correlated_rows(&filters.main, period_s);
+        let rows = filters.correlated_rows(period_s);
         let settle = (SETTLED * filters.delay / period_s).ceil() as u32;
         let blocks = Blocks::new(motor, priors, period_s, rows, settle, alarms_per_hour);
         let family = Family::of(Some(&blocks.spring.law));
@@ -278,7 +278,7 @@ impl Side {
             (known.x[INERTIA], known.x[DAMPING], known.x[RATE])
         });
         self.deflection.tune(&Tuning {
-            jerk: link.main[3] - self.balance.jerk(),
+            jerk: link.main[3] - self.balance.filtered().0[3],
             motor_noise: noise[0],
             link_noise: noise[1],
             inertia: if inertia > 0.0 { inertia } else { self.inertia },

@@ -36,6 +36,13 @@ impl Filters {
         squares
     }
 
+    /// Rows that the filters make of one independent error: the length of their impulse response over a period.
+    #[must_use]
+    pub fn correlated_rows(&self, period_s: f64) -> f64 {
+        // White noise through w⁴/(s + w)⁴ has the correlation time 2 ∫ρ dt = 32/(5 w).
+        (6.4 / (self.main.bandwidth * period_s)).max(1.0)
+    }
+
     /// √Σh² of the first derivative behind both filters: the noise of a rate over that of a position.
     #[must_use]
     pub fn rate_gain(&self, period_s: f64) -> f64 {

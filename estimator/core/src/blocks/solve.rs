@@ -9,7 +9,7 @@ use crate::gram::{
 };
 use crate::laws::{Law, PARAMETERS};
 use crate::spring::Projection;
-use crate::unknowns::{ACTIVE, CANDIDATES, DRY, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO};
+use crate::unknowns::{ACTIVE, CANDIDATES, CLIPS, DRY, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO};
 
 const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
 const WIDE: f64 = 1e6; // of a prior that says nothing
@@ -193,7 +193,11 @@ impl Blocks {
             if step + 1 < STEPS && far && !self.spring.is_settled() {
                 continue;
             }
-            self.friction = frame.rms(&total, &chosen, set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS));
+            self.friction = frame.rms(
+                &total,
+                &chosen,
+                set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS) | set(CLIPS),
+            );
             let omitted = self.omitted(&frame, &reduced, &total, &chosen, &used, noise);
             let attenuated = self.attenuated(&chosen, total.rows, noise);
             self.widen(&frame, &mut chosen, &used, noise, own);

@@ -41,7 +41,7 @@ SECTIONS = {
     "cycle": Section("One cycle beside the textbook way and the floor", quick="--seconds 2 --rounds 1"),
     "estimator_tick": Section("The estimator alone", quick="--ticks 8000"),
     "paper_table": Section("The paper's table"),
-    "ensembles": Section("The estimator on random joints", quick="--joints 1", of="estimators"),
+    "ensembles": Section("The estimator on random joints", "--joints 32", "--joints 1", of="estimators"),
     "long": Section("A minute of random joints", "--seconds 60", "--joints 1", of="estimators"),
     "undeclared": Section(
         "Effects that nobody declared, on an independent simulator",

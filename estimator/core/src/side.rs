@@ -338,7 +338,8 @@ impl Side {
 
     /// Names of the effects that nobody declared. A drive that samples or averages its torque is a period late.
     pub fn undeclared(&self) -> impl Iterator<Item = &'static str> {
-        let late = self.balance.late.abs() > self.period;
+        let (late, std) = self.blocks.torque_lateness();
+        let late = (self.balance.late + late).abs() - self.period > SURE * std;
         self.blocks.undeclared().chain(late.then_some("torque_delay"))
     }
 

@@ -56,7 +56,7 @@ impl Spring {
         }
         (mean[ZERO], std[ZERO]) = (-self.zero, zero_std);
         std[LATE] = priors.encoder_delay * period_s;
-        std[TORQUE_LATE] = period_s;
+        std[TORQUE_LATE] = 0.5 * period_s; // held, sampled, or averaged over a period
         self.with_declared(Prior::independent(mean, &std))
     }
 

@@ -9,7 +9,9 @@ use crate::gram::{
 };
 use crate::laws::{Law, PARAMETERS};
 use crate::spring::Projection;
-use crate::unknowns::{ACTIVE, CANDIDATES, CLIPS, DRY, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO};
+use crate::unknowns::{
+    ACTIVE, CANDIDATES, CLIPS, DRY, RATE, SOFT, SPRING, STOPS, Scale, Spring, TORQUE_LATE, ZERO,
+};
 
 const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
 const WIDE: f64 = 1e6; // of a prior that says nothing
@@ -286,7 +288,11 @@ impl Blocks {
             let effects = if self.spring.is_line() { groups.len() } else { CANDIDATES.len() };
             groups[..effects].fill(0);
         }
-        let found = choose(reduced, base, &groups, self.spring.shape(), prior, noise);
+        let mut found = choose(reduced, base, &groups, self.spring.shape(), prior, noise);
+        if !can_be(&solve(reduced, found, prior, noise)?) {
+            groups[0] = 0;
+            found = choose(reduced, base, &groups, self.spring.shape(), prior, noise);
+        }
         if many && !self.lost && frame.set >> ZERO & 1 == 1 {
             // The zero is where it is declared, or anywhere in the range.
             let log = log_evidence(reduced, found, prior, noise);
@@ -295,7 +301,7 @@ impl Blocks {
             let other = choose(reduced, base, &groups, self.spring.shape(), &elsewhere, noise);
             if log_evidence(reduced, other, &elsewhere, noise) > log + (groups.len() as f64).ln() {
                 let found = solve(reduced, other, &elsewhere, noise)?;
-                if self.is_seen(&found) {
+                if self.is_seen(&found) && can_be(&found) {
                     return Some((found, true));
                 }
             }
@@ -312,6 +318,11 @@ impl Blocks {
         let open = spring.law.is_polynomial() && !spring.is_anchored() && !straight;
         !open || 2.0 * moved.abs() < high.min(-low)
     }
+}
+
+/// Whether a solution is one that can be: no torque is read before it acts.
+pub(super) fn can_be(found: &Posterior) -> bool {
+    found.set >> TORQUE_LATE & 1 == 0 || found.x[TORQUE_LATE] >= 0.0
 }
 
 #[cfg(test)]

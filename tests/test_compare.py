@@ -177,7 +177,7 @@ def test_what_cannot_be_simulated_is_one_line_and_the_fit_figure_is_that_of_matl
 def test_three_lines_fit_predict_plot_and_write(fleet, tmp_path):
     run, other = (fleet / "recordings" / f"elbow-2026-01-0{day}.csv" for day in (5, 6))
     fit = drivelink.fit(run, joint=fleet / "joints" / "elbow.toml")
-    assert "motor 1: polynomial" in repr(fit) and "coefficients_nm_rad" in str(fit)
+    assert "motor 1: linear" in repr(fit) and "k_nm_rad" in str(fit)
     assert min(fit.predict(other, 0.05).fit_percent.values()) > 80.0
     assert fit.plot()._repr_png_().startswith(b"\x89PNG")
     better = fit.write(tmp_path / "better.toml")

@@ -328,12 +328,13 @@ impl Side {
         if self.doubtful || self.blocks.is_lost() {
             return None; // a zero that is elsewhere looks late
         }
-        let periods = |(late, std): (f64, f64)| {
-            let beyond = late.abs() - 0.5 * self.period > SURE * std;
-            beyond.then(|| (late / self.period).round())
-        };
-        let link = self.blocks.delay().and_then(periods).map(Shift::Late);
-        link.or_else(|| periods(self.blocks.torque_lateness()).map(Shift::TorqueLate))
+        let beyond = |(late, std): (f64, f64), least: f64| late.abs() - least * self.period > SURE * std;
+        let link = self.blocks.delay().filter(|late| beyond(*late, 0.5));
+        let torque = Some(self.blocks.torque_lateness()).filter(|late| beyond(*late, 1.0));
+        let periods = |(late, _): (f64, f64)| late / self.period;
+        // What is left of a torque's lateness is not below 0.
+        link.map(|late| Shift::Late(periods(late).round()))
+            .or_else(|| torque.map(|late| Shift::TorqueLate(periods(late).floor())))
     }
 
     /// Names of the effects that nobody declared. A drive that samples or averages its torque is a period late.

@@ -195,11 +195,7 @@ impl Blocks {
             if step + 1 < STEPS && far && !self.spring.is_settled() {
                 continue;
             }
-            self.friction = frame.rms(
-                &total,
-                &chosen,
-                set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS) | set(CLIPS),
-            );
+            self.friction = frame.rms(&total, &chosen, shaped());
             let omitted = self.omitted(&frame, &reduced, &total, &chosen, &used, noise);
             let attenuated = self.attenuated(&chosen, total.rows, noise);
             self.widen(&frame, &mut chosen, &used, noise, own);
@@ -288,25 +284,36 @@ impl Blocks {
             let effects = if self.spring.is_line() { groups.len() } else { CANDIDATES.len() };
             groups[..effects].fill(0);
         }
-        let mut found = choose(reduced, base, &groups, self.spring.shape(), prior, noise);
-        if !can_be(&solve(reduced, found, prior, noise)?) {
-            groups[0] = 0;
-            found = choose(reduced, base, &groups, self.spring.shape(), prior, noise);
-        }
+        let found = self.chosen(reduced, base, &groups, prior, noise)?;
         if many && !self.lost && frame.set >> ZERO & 1 == 1 {
             // The zero is where it is declared, or anywhere in the range.
-            let log = log_evidence(reduced, found, prior, noise);
             let elsewhere = self.prior(total, frame, self.deflection);
             groups[ALONE - 1..].fill(0); // a corner is at the declared zero
-            let other = choose(reduced, base, &groups, self.spring.shape(), &elsewhere, noise);
-            if log_evidence(reduced, other, &elsewhere, noise) > log + (groups.len() as f64).ln() {
-                let found = solve(reduced, other, &elsewhere, noise)?;
-                if self.is_seen(&found) && can_be(&found) {
-                    return Some((found, true));
-                }
+            let other = self.chosen(reduced, base, &groups, &elsewhere, noise)?;
+            let odds = other.log_evidence - found.log_evidence;
+            if odds > (groups.len() as f64).ln() && self.is_seen(&other) {
+                return Some((other, true));
             }
         }
-        solve(reduced, found, prior, noise).map(|found| (found, false))
+        Some((found, false))
+    }
+
+    /// The unknowns of these groups that evidence chooses.
+    fn chosen(
+        &self,
+        reduced: &Matrix,
+        base: Set,
+        groups: &Groups,
+        prior: &Prior,
+        noise: f64,
+    ) -> Option<Posterior> {
+        let of = |groups: &Groups| {
+            let found = choose(reduced, base, groups, self.spring.shape(), prior, noise);
+            solve(reduced, found, prior, noise)
+        };
+        let late = set(TORQUE_LATE..TORQUE_LATE + 1);
+        let causal = || groups.map(|group| if group == late { 0 } else { group });
+        of(groups).filter(is_causal).or_else(|| of(&causal()))
     }
 
     /// Whether a zero that has moved can be told from another curve: one whose law is open only where deflections reach as
@@ -320,8 +327,13 @@ impl Blocks {
     }
 }
 
-/// Whether a solution is one that can be: no torque is read before it acts.
-pub(super) fn can_be(found: &Posterior) -> bool {
+/// Unknowns whose shapes no joint has quite: friction, memory, the free curve.
+fn shaped() -> Set {
+    set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS) | set(CLIPS)
+}
+
+/// Whether no torque is read before it acts.
+pub(super) fn is_causal(found: &Posterior) -> bool {
     found.set >> TORQUE_LATE & 1 == 0 || found.x[TORQUE_LATE] >= 0.0
 }
 

@@ -158,10 +158,10 @@ def test_python_canopens_sync_is_one_master_and_its_period_is_measured(period_s)
     assert measured.period_s == pytest.approx(period_s, rel=0.1)  # the kernel's own timer is 4 % slow there
     clock = SyncClock(measured.period_s)
     jumps = [clock.jump(stamp_ns) for stamp_ns in stamps]
-    # The kernel's timer goes on from where it was late: time without SYNC is a gap, and no SYNC is one too many.
-    assert (
-        jumps.count(0) - sum(jump - 1 for jump in jumps if jump > 1) < 3
-    )  # one master, as the daemon counts
+    # An emulated kernel's timer changes its rate by more than the clock follows: a few SYNCs then are not due.
+    # Of two masters every other one is not.
+    surplus = jumps.count(0) - sum(jump - 1 for jump in jumps if jump > 1)
+    assert surplus < len(stamps) / 4
 
 
 def test_frames_that_the_kernel_dropped_because_nobody_read_them_are_counted():

@@ -81,6 +81,7 @@ def installation(
         "devices": "DeviceAllow=char-ttyACM rw\nDeviceAllow=char-ttyUSB rw\nSupplementaryGroups=dialout"
         if serial
         else "PrivateDevices=yes",
+        "can": "" if serial else "AF_CAN ",
         "addresses": " ".join(("localhost", *map(_address, allow))),
         "credentials": "\n".join(f"LoadCredential={_credential(text)}" for text in credentials),
     }

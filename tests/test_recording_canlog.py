@@ -2,9 +2,12 @@
 
 import logging
 import random
+import struct
+import zlib
 from io import BytesIO
 from types import SimpleNamespace
 
+import can
 import pytest
 
 from drivelink.cycle.objectcheck import RecentSamples
@@ -180,6 +183,53 @@ def test_a_sample_that_the_next_sync_completes_has_the_stamp_of_its_own():
     assert [cycle.stamp_ns for cycle in assembly.cycles(syncs([1e-4, 2e-4]), 1)] == [100]
 
 
-def test_empty_lines_of_an_asc_file_are_not_looked_at(tmp_path):
-    text = AscText(BytesIO(b"\n" * 1000 + b" \r\ndate\n\n"), tmp_path / "r.asc")
-    assert [text.readline(), text.readline()] == ["date\n", ""]
+def test_only_lines_of_an_asc_file_that_say_something_are_looked_at(tmp_path):
+    foreign = b"\n" * 1000 + b" \r\n// x\nx\n1\n0.1 1\n"
+    text = AscText(BytesIO(foreign + b"date x\n" + foreign), tmp_path / "r.asc")
+    assert [text.readline(), text.readline()] == ["date x\n", ""]
+
+
+def test_a_text_with_more_foreign_lines_than_frames_is_no_log(tmp_path):
+    path, frame = tmp_path / "r.log", b"(1.0) can0 080#\n"
+    path.write_bytes(frame * 100 + b"x\n" * 120)
+    assert len(list(read_frames(path))) == 100
+    path.write_bytes(frame * 100 + b"x\n" * 500_000)
+    with pytest.raises(RecordingError, match="lines as candump writes them, got line 101: 'x'"):
+        list(read_frames(path))
+
+
+def test_blf_objects_are_read_as_python_can_reads_them(tmp_path):
+    """Of CAN and CAN FD, with either head and unit, remote, with long identifiers, with zeros left out, others."""
+    rng, objects = random.Random(1), b""
+    for k in range(400):
+        version, kind = k % 2 + 1, (1, 86, 100, 101, 73, 96)[k % 6]
+        channel, payload = k % 3 + 1, rng.randbytes(64)
+        can_id = rng.choice((0x80, 0x181, 0x7FF, 0x800, 0x8000_0080, 0x8000_0800))
+        remote, length = rng.random() < 0.1, rng.choice((0, 1, 7, 8, 12, 64))
+        if kind == 100:
+            body = struct.pack("<HBBLLBBB5x64s", channel, 128 * remote, 9, can_id, 0, 0, 1, length, payload)
+        elif kind == 101:
+            further, flags = rng.choice((0, 32 + 8 * (version == 2) + 40 + length)), 0x1000 + 16 * remote
+            written = payload[: rng.choice((length, length // 2 if not further else length))]
+            body = struct.pack("<BBBxL4xL19xB4x", channel, 9, length, can_id, flags, further) + written
+        else:
+            body = struct.pack("<HBBL8s", channel, 128 * remote, min(length, 8), can_id, payload).ljust(48)
+        head = 32 + 8 * (version == 2)
+        stamp = struct.pack("<LHHQ", k % 3, 0, 0, k * 1000).ljust(head - 16, b"\0")
+        base = struct.pack("<4sHHLL", b"LOBJ", head, version, head + len(body), kind)
+        objects += base + stamp + body + bytes(-len(body) % 4)
+    whole = struct.pack("<4sL32x8H88x", b"LOGG", 144, 1970, 1, 4, 1, 0, 1, 0, 500)
+    for at in range(0, len(objects), 5000):
+        packed = zlib.compress(objects[at : at + 5000])
+        whole += struct.pack("<4sHHLLH14x", b"LOBJ", 16, 1, 32 + len(packed), 10, 2) + packed
+        whole += bytes(len(packed) % 4)
+    path = tmp_path / "r.blf"
+    path.write_bytes(whole)
+    expected = [
+        LoggedFrame(round(m.timestamp * 1e9), m.arbitration_id, bytes(m.data), str(m.channel))
+        for m in can.BLFReader(path)
+        if not (m.is_remote_frame or m.is_extended_id or m.is_error_frame) and m.arbitration_id <= 0x7FF
+    ]
+    assert len(expected) > 60
+    for channel in dict.fromkeys(one.channel for one in expected):
+        assert list(read_frames(path, channel)) == [one for one in expected if one.channel == channel]

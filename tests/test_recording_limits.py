@@ -342,6 +342,35 @@ def test_a_blf_file_unpacks_to_so_many_frames_and_bytes(tmp_path):
             blf_of(tmp_path / "r.blf", count, containers)
 
 
+def blf_of_objects(path, objects):
+    path.write_bytes(BLF_HEAD + b"".join(blf_container(zlib.compress(one, 9), 0) for one in objects))
+    return path
+
+
+def test_a_blf_object_without_a_length_and_one_without_an_end_are_ends(tmp_path, caplog):
+    """The first was read for ever; the second was copied for each container."""
+    empty = struct.pack("<4sHHLLLHHQ", b"LOBJ", 32, 1, 0, 99, 2, 0, 0, 0)
+    assert len(list(read_frames(blf_of_objects(tmp_path / "r.blf", [blf_frame() * 3 + empty])))) == 3
+    assert "broken after 3 frames (expected no object of 0 bytes)" in caplog.text
+    endless = empty[:8] + struct.pack("<L", 1 << 31) + empty[12:]
+    path = blf_of_objects(tmp_path / "r.blf", [blf_frame() * 3 + endless, *[bytes(1000)] * 10_000])
+    before = time.process_time()
+    with little_memory():
+        assert len(list(read_frames(path))) == 3
+    assert time.process_time() - before < 3.0
+
+
+def test_a_blf_container_that_begins_at_the_limit_unpacks_to_nothing(tmp_path):
+    """Its decoder takes 0 bytes as no limit."""
+    path, bomb, size = tmp_path / "r.blf", zlib.compress(bytes(BOMB), 9), 400_000
+    endless = struct.pack("<4sHHLLLHHQ", b"LOBJ", 32, 1, 1 << 31, 99, 2, 0, 0, 0)
+    fill = zlib.compress(endless.ljust(32 * size + (1 << 20), b"\0"), 9)
+    path.write_bytes(BLF_HEAD + blf_container(fill, 0) + blf_container(bomb, 0))
+    os.truncate(path, size)
+    with little_memory(), one_line("at most 64 MiB"):
+        list(read_frames(path))
+
+
 @pytest.mark.parametrize(
     ("can_id", "read_of_it", "said"),
     [
@@ -355,7 +384,7 @@ def test_a_log_that_is_none_of_canopen_is_not_read_to_its_end(
     packed = zlib.compress(blf_frame(can_id) * 5000, 0)
     (tmp_path / "r.blf").write_bytes(BLF_HEAD + blf_container(packed, 5000) * 30)
     kind, passed = CAN_FORMATS[".blf"], []
-    counting = kind._replace(reader=lambda file: (passed.append(1) or m for m in can.BLFReader(file)))
+    counting = kind._replace(reader=lambda *a: (passed.append(1) or frame for frame in kind.reader(*a)))
     monkeypatch.setitem(CAN_FORMATS, ".blf", counting)
     with one_line(said):
         read(tmp_path / "r.blf", JOINT)

@@ -1,4 +1,4 @@
-"""Reads raw CAN logs of other tools: variants of candump; BLF, ASC by python-can's readers.
+"""Reads raw CAN logs of other tools: variants of candump; BLF; ASC by python-can's reader.
 
 Yields data frames with 11-bit identifiers as tuples, in file order.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+from binascii import unhexlify
 from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime
 from itertools import chain, islice, pairwise
@@ -19,9 +20,9 @@ import can
 
 from drivelink.errors import RecordingError
 from drivelink.files import open_regular
+from drivelink.recording.blf import Frame, blf_frames
 from drivelink.recording.limits import (
     AscText,
-    BlfBytes,
     most_records,
     require_stamp,
     too_many_records,
@@ -39,31 +40,25 @@ class _BlfWriter(can.BLFWriter):
         self._flush()
 
 
+_Reader = Callable[[IO[bytes], Path], Iterator[Frame | None]]
+
+
 class CanFormat(NamedTuple):
     """A format of raw frames."""
 
     tool: str  # that writes it
     writer: Any  # python-can's; None: not written
-    reader: Any = None  # python-can's; None: text as candump writes it, read here
-    bounded: Any = None  # what the reader reads from, see `limits`
+    # yields a file's frames, None for those that are not of CANopen; None: text as candump writes it
+    reader: _Reader | None = None
     text: bool = True  # whether it has lines
 
 
-CAN_FORMATS = {
-    ".log": CanFormat("candump", can.CanutilsLogWriter),
-    ".candump": CanFormat("candump", None),
-    ".blf": CanFormat("Vector", _BlfWriter, can.BLFReader, BlfBytes, text=False),
-    ".asc": CanFormat("Vector", can.ASCWriter, can.ASCReader, AscText),
-}
-"""Formats of raw frames, by the ending of the file's name."""
-
-CAN_SUFFIXES = frozenset(CAN_FORMATS)
 NO_STAMP = -1
 _EXTENDED_DIGITS = 8
 _LAST_ID = 0x7FF
 _LONGEST = 64  # bytes of a frame, excluding CAN XL
 _LINE = 16 << 10  # bytes; candump's longest, of CAN XL, has 6 KiB
-_HOPELESS = 20  # unknown lines at the beginning after which it is not a log
+_HOPELESS = 20  # more unknown lines than frames: it is not a log
 _FOREIGN = 20_000  # messages at the beginning without a frame of CANopen, likewise
 _DISORDER_NS = 1_000_000_000  # largest disorder of stamps within a file
 _GAP_NS = 1_000_000_000
@@ -104,7 +99,8 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
     Raises:
         RecordingError: it cannot be read, has another format, or its channel is unknown.
     """
-    frames = _library_frames(path) if CAN_FORMATS[path.suffix.lower()].reader else _text_frames(path)
+    reader = CAN_FORMATS[path.suffix.lower()].reader
+    frames = _foreign_frames(path, reader) if reader else _text_frames(path)
     head = list(islice(frames, _LOOK_AHEAD))
     chosen = channel or _channel(head, configured, path)
     whole: Iterator[LoggedFrame] = chain(head, frames)
@@ -182,15 +178,14 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
             frame = _either(line, parsers)
         except ValueError:
             strange += 1
-            shown = repr(line.strip()[:60].decode(errors="replace"))
-            first_strange = first_strange or f"line {number}: {shown}"
-            if not understood and strange > _HOPELESS:
+            first_strange = first_strange or f"line {number}: {line.strip()[:60].decode(errors='replace')!r}"
+            if strange > understood + _HOPELESS:
                 break
             continue
         understood += 1
         if frame is not None:
             yield frame
-    if not understood:
+    if not understood or strange > understood + _HOPELESS:
         raise RecordingError(f"{path}: expected lines as candump writes them, got {first_strange or 'none'}")
     if strange:
         text = "%s: %d line(s) are not CAN frames and are omitted, first %s"
@@ -234,7 +229,7 @@ def _frame(
     seconds: bytes | None, fraction: bytes, channel: bytes, can_id: bytes, data: bytes
 ) -> LoggedFrame | None:
     """Return a frame of its texts; None: it is none of CANopen's."""
-    payload = bytes.fromhex(data.decode())
+    payload = unhexlify(data)
     if len(can_id) == _EXTENDED_DIGITS or int(can_id, 16) > _LAST_ID or len(payload) > _LONGEST:
         return None
     return LoggedFrame(_stamp(seconds, fraction), int(can_id, 16), payload, channel.decode(errors="replace"))
@@ -278,32 +273,47 @@ def _added_up(frames: Iterable[LoggedFrame]) -> Iterator[LoggedFrame]:
         yield frame._replace(stamp_ns=total)
 
 
-def _library_frames(path: Path) -> Iterator[LoggedFrame]:
-    """Read by python-can's reader; a truncated file ends at its last complete frame."""
-    kind = CAN_FORMATS[path.suffix.lower()]
+def _asc_frames(file: IO[bytes], path: Path) -> Iterator[Frame | None]:
+    """The frames as python-can reads them; None: one without data, or with a long identifier."""
+    for message in can.ASCReader(AscText(file, path)):  # type: ignore[arg-type]
+        special = message.is_extended_id or message.is_error_frame or message.is_remote_frame
+        stamp_ns, data = round(message.timestamp * 1e9), bytes(message.data)
+        yield None if special else (stamp_ns, message.arbitration_id, data, str(message.channel))
+
+
+def _foreign_frames(path: Path, reader: _Reader) -> Iterator[LoggedFrame]:
+    """Those of another tool's format; a truncated file ends at its last complete frame."""
     count = foreign = 0
     try:
-        # Opened here, because a reader leaves a malformed file open.
         with open_regular(path) as file:
             most = most_records(os.fstat(file.fileno()).st_size)
-            for message in kind.reader(kind.bounded(file, path)):
+            for frame in reader(file, path):
                 most -= 1
                 if most < 0:
                     raise too_many_records(path)
-                special = message.is_extended_id or message.is_error_frame or message.is_remote_frame
-                if special or message.arbitration_id > _LAST_ID or len(message.data) > _LONGEST:
+                if frame is None or frame[1] > _LAST_ID or len(frame[2]) > _LONGEST:
                     foreign += 1
                     if not count and foreign > _FOREIGN:
                         return
                     continue
                 count += 1
-                stamp_ns = round(message.timestamp * 1e9)
-                yield LoggedFrame(stamp_ns, message.arbitration_id, bytes(message.data), str(message.channel))
+                yield LoggedFrame._make(frame)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     except RecordingError:
         raise
-    except Exception as error:  # readers raise various exceptions for damaged files
+    except Exception as error:  # python-can raises various exceptions for damaged files
         if not count:
             raise RecordingError(f"{path}: cannot be read as {path.suffix} log: {str(error)[:80]}") from error
         _LOG.warning("%s: broken after %d frames (%.80s): the rest is omitted", path, count, error)
+
+
+CAN_FORMATS = {
+    ".log": CanFormat("candump", can.CanutilsLogWriter),
+    ".candump": CanFormat("candump", None),
+    ".blf": CanFormat("Vector", _BlfWriter, blf_frames, text=False),
+    ".asc": CanFormat("Vector", can.ASCWriter, _asc_frames),
+}
+"""Formats of raw frames, by the ending of the file's name."""
+
+CAN_SUFFIXES = frozenset(CAN_FORMATS)

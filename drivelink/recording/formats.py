@@ -132,8 +132,8 @@ def _rows(file: IO[bytes], layout: _Layout, path: Path, first_line: int) -> Iter
 
 def _row(cells: list[str], layout: _Layout) -> list[float]:
     try:
-        return [float(cells[place]) for place in layout.places]
-    except ValueError:  # an empty cell, a decimal comma, or a word
+        return [float(cells[place] or "nan") for place in layout.places]
+    except ValueError:  # a decimal comma, or a word
         return [_number(cells[k].strip(), name) for k, name in zip(layout.places, layout.used, strict=True)]
 
 

@@ -1,17 +1,14 @@
-"""Memory limits of recordings, checked before allocation, and bounded input of python-can's readers.
+"""Limits of recordings, checked before allocation, and bounded input of python-can's reader of ASC files.
 
 A file declares the lengths of its parts and may declare anything. Real recordings are far below these limits
-(docs/reference/recordings.md). python-can's readers accept lines and containers of any length, and ignore
-relative stamps of an ASC file.
+(docs/reference/recordings.md). python-can's reader accepts lines of any length, and ignores relative stamps.
 """
 
 from __future__ import annotations
 
 import io
 import logging
-import os
 import re
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -63,11 +60,6 @@ def require_stamp(stamp_ns: int, path: Path) -> None:
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_BLF_RATIO = 32  # of unpacked bytes to those of the file: of a bus at rest they are 10
-_SMALL_BYTES = 1 << 20  # that any file may unpack to
-_OBJECT_HEAD = _CONTAINER_HEAD = 16  # bytes
-_CONTAINER = b"\x0a\0\0\0"  # type of object
-_DEFLATED = b"\x02\0"  # method of compression; 0: none
 _STAMP = re.compile(r"^[ \t]*(\d{1,12}\.\d{1,12})(?=[ \t])")
 _RELATIVE = re.compile(r"^\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
 # time CANFD channel Rx identifier [name] BRS ESI DLC length duration bits flags …, of a frame without data
@@ -76,6 +68,9 @@ _EMPTY_FD = re.compile(
     r"\s+\d+\s+\d+\s+([0-9A-Fa-f]+)(?:\s|$)"
 )
 _REMOTE = 0x10  # among these flags
+_NEWLINE = ord("\n")
+# what python-can looks at in an ASC file; a megabyte of other lines costs it more than a second
+_OF_ASC = re.compile(rb"\s*(?:\d+\.\d+\s+\S+\s+\S|(?:date|base|begin|internal|no)\s)", re.IGNORECASE)
 
 
 def whole_lines(file: IO[bytes], path: Path, number: int = 1) -> Iterator[bytes]:
@@ -86,50 +81,15 @@ def whole_lines(file: IO[bytes], path: Path, number: int = 1) -> Iterator[bytes]
     """
     padded = False  # after a power loss
     while line := file.readline(MAX_LINE_BYTES + 1):
-        if not line.strip(b"\0"):
+        if line[-1] == _NEWLINE and not padded:
+            number += 1
+            yield line
+        elif not line.strip(b"\0"):
             padded = True
         elif padded or len(line) > MAX_LINE_BYTES:
             raise RecordingError(f"{path}: line {number}: expected at most {MAX_LINE_BYTES >> 10} KiB")
-        elif line.endswith(b"\n"):
-            number += 1
-            yield line
         elif line.strip(b" \t\r\0"):
             _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
-
-
-class BlfBytes(io.BufferedIOBase):
-    """The bytes of a BLF file, its containers unpacked within limits."""
-
-    def __init__(self, file: IO[bytes], path: Path) -> None:
-        super().__init__()
-        self._file, self._path = file, path
-        self._left = _BLF_RATIO * os.fstat(file.fileno()).st_size + _SMALL_BYTES
-        self._container = False  # what is read next is one
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Read so many bytes.
-
-        Raises:
-            RecordingError: the containers exceed the limit.
-        """
-        if size is None or not 0 <= size <= MAX_BLOCK_BYTES:
-            raise self._too_large()
-        data = self._file.read(size)
-        if self._container and data[:2] == _DEFLATED:
-            unpacker = zlib.decompressobj()
-            content = unpacker.decompress(data[_CONTAINER_HEAD:], self._left)
-            if unpacker.unconsumed_tail:
-                raise self._too_large()
-            self._left -= len(content)
-            return bytes(_CONTAINER_HEAD) + content
-        self._container = size == _OBJECT_HEAD and data[-4:] == _CONTAINER
-        return data
-
-    def _too_large(self) -> RecordingError:
-        return RecordingError(
-            f"{self._path}: expected containers of at most {MAX_BLOCK_BYTES >> 20} MiB, "
-            f"unpacked {_BLF_RATIO} times the file, got larger ones"
-        )
 
 
 class AscText(io.TextIOBase):
@@ -137,8 +97,7 @@ class AscText(io.TextIOBase):
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         super().__init__()
-        # A megabyte of empty lines costs python-can more than a second.
-        self._lines = (line for line in whole_lines(file, path) if not line.isspace())
+        self._lines = filter(_OF_ASC.match, whole_lines(file, path))
         self._relative = False
         self._total = 0.0
 

@@ -9,7 +9,10 @@ import re
 import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -20,9 +23,10 @@ from drivelink.demo.closedloop import CASES, STEPS, ClosedLoop
 from drivelink.demo.closing import Comparison, as_json
 from drivelink.demo.closing import closing as closing_section
 from drivelink.demo.rig import RunSummary
-from drivelink.demo.watching import DemoRun
+from drivelink.demo.watching import DemoRun, RigProcess
 from drivelink.monitor.history import TruePoint
-from drivelink.output.document import show
+from drivelink.monitor.view import JointView
+from drivelink.output.document import Paragraph, Section, show
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Status, TransmissionEstimate
 
@@ -68,6 +72,24 @@ def test_what_is_not_valid_is_not_counted_and_an_interval_that_misses_the_truth_
 SUMMARY = RunSummary(1200, 1150, 3, 180.0, 40.0, "")
 
 
+def test_a_live_view_is_drawn_by_the_thread_that_feeds_it(monkeypatch):
+    """Another one would find the history longer in the middle of it."""
+    drawn, draw = [], JointView.__rich_console__
+    monkeypatch.setattr(
+        JointView, "__rich_console__", lambda *a: [drawn.append(threading.current_thread()), *draw(*a)][1:]
+    )
+    console = Console(file=io.StringIO(), force_terminal=True, width=80, height=24)
+    run, begin = DemoRun(jointfile.load(ELBOW), console, live=True), time.monotonic()
+
+    def poll(seconds):
+        time.sleep(seconds)
+        run.summary = SUMMARY if time.monotonic() > begin + 0.6 else None
+
+    subscription = SimpleNamespace(cycles=lambda _: [message(1, 2.0, 100.0), None], status=None)
+    run.follow(RigProcess(SimpleNamespace(poll=poll), lambda: None), subscription)
+    assert len(drawn) > 2 and set(drawn) == {threading.current_thread()}
+
+
 def closing(comparison: Comparison) -> str:
     console = Console(width=100, record=True, file=io.StringIO())
     show([closing_section("vsa-ii", comparison, SUMMARY, 1150, 1e-3)], console)
@@ -111,8 +133,10 @@ def test_a_terminal_breaks_what_is_said_between_words_and_a_file_not_at_all(term
     console, path = Console(file=out, force_terminal=terminal, width=40), ELBOW
     case = CASES["friction"]
     run = ClosedLoop(jointfile.load(path), path, case, console, live=False, yes=True, limit_s=1.0)
-    run._say(words)
-    assert " ".join(out.getvalue().split()) == words and (out.getvalue().count("\n") > 1) is terminal
+    for say in (run._say, lambda text: show([Section("", [Paragraph(text)])], console)):
+        say(words)
+        assert " ".join(out.getvalue().split()) == words and (out.getvalue().count("\n") > 1) is terminal
+        out.seek(out.truncate(0))
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from drivelink.monitor.statuslines import shape, status_lines
 from drivelink.monitor.terminal import can_draw, joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.web import snapshot
-from drivelink.output.numbers import number, with_interval
+from drivelink.output.numbers import axis_labels, number, with_interval
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
@@ -77,7 +77,7 @@ def test_the_view_fits_the_terminal(motors, truth):
 
 def test_the_view_says_what_matters_at_80_by_24():
     text = "\n".join(lines(filled(truth=True)))
-    for part in ("elbow", "running", "stiffness", "±", "N·m/rad", "truth", "error 0.20 %", "torque", "deflection",
+    for part in ("elbow", "running", "stiffness", "±", "N·m/rad", "truth", "rms error 0.20 %", "torque", "deflection",
                  "1000 Hz", "95", "missed 2", "1 operational", "2 stopped FAULT", "node 2 reports a fault",
                  "valid", "observable", "bus 38 %"):  # fmt: skip
         assert part in text, part
@@ -193,6 +193,24 @@ def test_numbers_are_short_and_their_digits_follow_the_uncertainty(value, half, 
         assert number(value) == text
     else:
         assert with_interval(value, half, "N·m") == f"{text} N·m"
+
+
+@pytest.mark.parametrize(
+    ("values", "labels"),
+    [
+        ([-0.0938, -0.0312, 0.0314], "−0.094 −0.031 0.031"), ([6.48e-4, 2.93e-4, -6.2e-5], "6.5e−4 2.9e−4 −0.6e−4"),
+        ([-12.0, -6.0, -1e-9], "−12.0 −6.0 0.0"), ([120.0, 121.0], "120.0 121.0"), ([1e7, 2e7], "1.0e7 2.0e7"),
+    ],
+)  # fmt: skip
+def test_the_labels_of_an_axis_have_one_power_of_ten_and_digits_of_their_distance(values, labels):
+    assert " ".join(axis_labels(values)) == labels
+
+
+def test_an_error_of_the_valid_cycles_does_not_stand_beside_an_estimate_that_is_not():
+    view = filled(truth=True)
+    last = estimate(5000, status=0)
+    view.update(last, 5.0, Truth(last[2], last[3]))
+    assert "truth" in "\n".join(lines(view)) and " error " not in "\n".join(lines(view))
 
 
 def test_sparkline_and_plot_take_anything_and_are_never_wider_than_their_room():
@@ -340,6 +358,7 @@ def test_the_residual_is_a_gauge_against_its_baseline_before_and_after():
 def test_a_residual_without_gauge_is_not_always_one_without_baseline(watching, why):
     view = filled()
     view.status = {"residual_nm": 0.0, "residual_alarm": {"active": watching, "watching": watching}}
+    assert "0.00 N·m" not in f"{view.line()}{lines(view)}"  # there is none
     assert snapshot(view, True, {})["status"]["no_gauge"].startswith(why)
     assert why in "\n".join(lines(view, 120, 40))
 

@@ -21,6 +21,7 @@ PAGE = HERE.parent / "drivelink" / "monitor" / "page.html"
 STATUS = {
     "state": "running", "rate_hz": 1000.0, "nodes": {"1": {"state": "operational", "fault": False}},
     "residual_alarm": {"active": False, "residual_nm": [0.01], "floor_nm": [0.02]}, "transmissions": [{}],
+    "events": [{"time": 1.7e9, "text": "node 2 reports a fault", "count": 1}],
 }  # fmt: skip
 SPAN = """
     take(sent[0]);
@@ -158,17 +159,18 @@ def test_what_is_not_valid_is_shown_grey_with_the_reason_and_sets_no_scale():
 def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers():
     gone = fed()
     gone.gone, gone.silent_s = True, 12.0
-    state, style, flags, number_style, gauges, rows = page(
+    state, style, flags, number_style, gauges, hidden, rows, events = page(
         """
         take(sent[0]);
         take(sent[1]);
         const styles = $("flags").children.map(flag => flag.className);
         return [shown("state"), $("state").className, styles, $("stiffness").className, $("gauges").hidden,
-                $("cycle").children.length + $("nodes").children.length];
+                $("cyclesection").hidden, $("cycle").children.length, shown("nodes")];
         """,
         fed(),
         gone,
     )
     assert state == "daemon gone, last estimate 12 s ago" and style == "red"
     assert flags == ["flag red"] and number_style == "past"
-    assert gauges and rows == 0
+    assert gauges and hidden and rows == 0
+    assert "operational" not in events and "node 2 reports a fault" in events  # what led to it stays

@@ -22,7 +22,7 @@ from drivelink.monitor.view import JointView
 from drivelink.pubsub.client import Subscription
 
 _PATIENCE_S = 20.0  # for the other process to start, and to end
-_LINE_S = 1.0
+_LINE_S, _FRAME_S = 1.0, 0.125  # between plain lines, and pictures on a terminal
 
 
 class RigProcess(NamedTuple):
@@ -63,6 +63,7 @@ class DemoRun:
         self._view.footer = "Ctrl-C ends"
         self._console = console
         self._live = live
+        self._screen: Live | None = None
         self._period_s = joint.bus.period_s
         self._next_line_s = 0.0
 
@@ -74,7 +75,8 @@ class DemoRun:
         """
         if not self._live:
             return self._to_the_end(rig, subscription)
-        with Live(self._view, console=self._console, refresh_per_second=8, screen=False, transient=True):
+        # Drawn by this thread alone: the history must not grow under the one that draws it.
+        with Live(self._view, console=self._console, auto_refresh=False, transient=True) as self._screen:
             return self._to_the_end(rig, subscription)
 
     def _to_the_end(self, rig: RigProcess, subscription: Subscription) -> bool:
@@ -123,6 +125,9 @@ class DemoRun:
             last, truth = self.comparison.latest
             self._view.update(last, last.sequence * self._period_s, truth)
             self._view.errors = self.comparison.errors()[1:3]
-        if not self._live and time.monotonic() >= self._next_line_s:
-            self._next_line_s = time.monotonic() + _LINE_S
-            sys.stderr.write(f"{self._view.line()}\n")
+        if time.monotonic() >= self._next_line_s:
+            self._next_line_s = time.monotonic() + (_FRAME_S if self._live else _LINE_S)
+            if self._screen is not None:
+                self._screen.refresh()
+            else:
+                sys.stderr.write(f"{self._view.line()}\n")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from rich.text import Text
 
 from drivelink.monitor.history import usual_range
-from drivelink.output.numbers import number
+from drivelink.output.numbers import axis_labels
 
 _BARS = "▁▂▃▄▅▆▇█"
 # Bit of the dot at column c (0, 1) and row r (0 on top) of a braille character.
@@ -56,11 +56,8 @@ class DotPlot:
         self._x, self._y = _opened(*x), _opened(*y)
         self.rows = max(2, height - 2)
         parts = 1 if self.rows < 8 else 2 if self.rows < 13 else 4
-        top, bottom = self._y[1], self._y[0]
-        self._labels = {
-            round(k * (self.rows - 1) / parts): number(top + k * (bottom - top) / parts, 3)
-            for k in range(parts + 1)
-        }
+        places = [round(k * (self.rows - 1) / parts) for k in range(parts + 1)]
+        self._labels = dict(zip(places, _ticks(self._y[1], self._y[0], parts), strict=True))
         self._margin = max(6, *map(len, self._labels.values()))
         self.columns = max(4, width - self._margin - 1)
         self._cells = [[0] * self.columns for _ in range(self.rows)]
@@ -125,10 +122,10 @@ class DotPlot:
                     text.append("●", style=mark)
                 else:
                     text.append(chr(_BLANK + dots) if dots else " ", style=style)
-        low, high = number(self._x[0], 3), f"{number(self._x[1], 3)} {x_unit}".rstrip()
+        low, middle, high = _ticks(*self._x, 2)
+        high = f"{high} {x_unit}".rstrip()
         axis = low + high.rjust(self.columns - len(low))
         if self.columns >= 40:
-            middle = number(0.5 * (self._x[0] + self._x[1]), 3)
             place = (self.columns - len(middle)) // 2
             axis = axis[:place] + middle + axis[place + len(middle) :]
         text.append("\n" + " " * (self._margin + 1) + axis, style="dim")
@@ -145,6 +142,10 @@ class DotPlot:
         if 0 <= c < 2 * self.columns and 0 <= r < 4 * self.rows:
             self._cells[r // 4][c // 2] |= _DOTS[c % 2][r % 4]
             self._styles[r // 4][c // 2] = style
+
+
+def _ticks(first: float, last: float, parts: int) -> list[str]:
+    return axis_labels([first + k * (last - first) / parts for k in range(parts + 1)])
 
 
 def _opened(low: float, high: float) -> tuple[float, float]:

@@ -1,9 +1,10 @@
 """Terminal widgets of a joint's live view, for `monitor` and `demo`, from 80 columns by 24 lines on.
 
 view = JointView("elbow", subtitle="vsa-ii on the virtual bus")
-with rich.live.Live(view, refresh_per_second=10) as live:
+with rich.live.Live(view, auto_refresh=False) as live:
     view.update(estimate, time_s, truth)     # every cycle if you like, some microseconds
     view.status = latest_status              # the JSON of the status key
+    live.refresh()                           # some times a second, by the thread that updates
 print(view.line())                           # the same in one plain line, where there is no terminal
 """
 
@@ -39,7 +40,7 @@ _HELP = (
     ("stiffness", "of the joint, N·m/rad, ± half its 95 % interval"),
     ("torque", "flexibility torque of the joint, N·m"),
     ("external", "external torque on the link, N·m, ± half its 95 % interval"),
-    ("deflection", "φ = q − θ of each transmission, rad"),
+    ("deflection", "φ = q − θ of each transmission, rad; each: its stiffness, N·m/rad"),
     ("left plot", "stiffness over deflection, band dotted, ● now; cyan motor 1, magenta 2; grey dots: model"),
     ("right plot", "flexibility torque over time; yellow: truth of a simulation; grey: not valid"),
     ("cycle", "99th percentiles, µs: work, answer (SYNC to last frame), SYNC late by"),
@@ -139,7 +140,7 @@ class JointView:
             "rad, " + ", ".join(text for text, _ in self.flags),
         ]
         if math.isfinite(self.errors[0]):
-            parts[-1] += f", stiffness error {100 * self.errors[0]:.2f} %"
+            parts[-1] += f", stiffness rms error {100 * self.errors[0]:.2f} %"
         if self.status:
             parts[-1] += f", {status_text(self.status, self.model, self.finding)}"
         return " ".join(parts)
@@ -189,9 +190,9 @@ class JointView:
             waiting.add_row(Text("waiting for the first estimate …", style="dim"))
             return waiting
         last = window[-1]
-        spark = max(6, width - 69)
-        ink = ESTIMATE if self.live and last.valid else "dim"
         known = math.isfinite(last.true_stiffness_nm_rad)
+        spark = max(4, width - (74 if known else 69))
+        ink = ESTIMATE if self.live and last.valid else "dim"
         stiffness, half = value_and_interval(last.stiffness_nm_rad, half_interval(estimate))
         band = f" ± {half}" if half else ""
         for label, value, extra, unit, true, error, series in (
@@ -206,7 +207,7 @@ class JointView:
                 Text.assemble(
                     "truth ",
                     (number(true), TRUTH),
-                    f"  error {100 * error:.2f} %" if math.isfinite(error) else "",
+                    f"  rms error {100 * error:.2f} %" if last.valid and math.isfinite(error) else "",
                 )
                 if known
                 else "",

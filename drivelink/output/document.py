@@ -108,12 +108,12 @@ def show(sections: Iterable[Section], console: Console) -> None:
     for section in sections:
         for block in section.blocks:
             if isinstance(block, Paragraph):
-                console.print(Text(block.text), soft_wrap=True)
+                console.print(Text(block.text), soft_wrap=not console.is_terminal)
             elif isinstance(block, Grid):
                 console.print(_printed(block, section.title, console))
             elif isinstance(block, Lines):
                 for line in block.lines:
-                    console.print(Text(f"  {line}"), soft_wrap=True)
+                    console.print(Text(f"  {line}"), soft_wrap=not console.is_terminal)
 
 
 def as_text(sections: Iterable[Section]) -> str:

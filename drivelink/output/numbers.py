@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from estimator.model import ParameterValue
 from estimator.sample import SIGMA_95
@@ -17,6 +18,16 @@ def number(value: float, digits: int = 4) -> str:
         return f"{mantissa}e{int(exponent)}".replace("-", "−")
     decimals = digits - 1 - (math.floor(math.log10(abs(value))) if value else 0)
     return f"{value:.{max(0, min(decimals, max(digits, 4)))}f}".replace("-", "−")
+
+
+def axis_labels(values: Sequence[float]) -> list[str]:
+    """Return the labels of an axis' even places: one power of ten, and two digits of their distance."""
+    largest, apart = max(map(abs, values)), abs(values[1] - values[0])
+    power = 0 if 1e-3 <= largest < 1e5 else math.floor(math.log10(largest))
+    decimals = max(0, power + 1 - math.floor(math.log10(apart)))
+    texts = [f"{value / 10.0**power:.{decimals}f}" for value in values]
+    texts = [text.removeprefix("-") if not text.strip("-0.") else text for text in texts]
+    return [f"{text}e{power}".replace("-", "−") if power else text.replace("-", "−") for text in texts]
 
 
 def value_and_interval(value: float, half: float | None, digits: int = 4) -> tuple[str, str]:

@@ -57,6 +57,7 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(verb, arguments, tmp_path
         (["replay", "none.csv"], 3, "none.csv"),
         (["fit", "none.csv"], 3, "none.csv"),
         (["diagnose", "none.csv"], 3, "none.csv"),
+        *(([verb, "there.toml"], 2, "there.toml is a joint file: expected a recording") for verb in ("fit", "diagnose", "replay")),
         (["doctor", "none.toml"], 2, "none.toml: cannot be read"),
         (["service", "install", "none.toml", "--root", "stage"], 2, "none.toml: cannot be read"),
         (["new", "there.toml"], 2, "there.toml"),
@@ -75,7 +76,7 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(verb, arguments, tmp_path
         (["sim", "far.toml"], 4, "port"),
         (["sim", "driveless.toml"], 2, "driveless.toml: motor[1].drive: expected this table"),
         (["fit", "r.csv", "--joint", "linaer.toml"], 2, "linaer.toml: motor[1]: transmission.model: expected one of linear"),
-        (["fit", "there.toml", "--joint", "elbow.toml", "--out", "there.toml"], 2, "there.toml: expected a folder, got a file"),
+        (["fit", "r.csv", "--joint", "elbow.toml", "--out", "there.toml"], 2, "there.toml: expected a folder, got a file"),
         (["compare", "elbow.toml", "elbow.toml", "--out", "there.toml"], 2, "there.toml: expected a folder, got a file"),
         (["record", "elbow.toml", "--out", "r.xyz"], 3, "expected a name that ends in .mcap"),
         (["record", "elbow.toml", "--out", "none/r.csv"], 3, "cannot be written"),
@@ -103,6 +104,7 @@ def test_what_a_verb_cannot_do_is_one_line(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("drivelink.cli.record._ALIVE_S", 0.1)
     (tmp_path / "there.toml").write_text("# mine\n")
+    (tmp_path / "r.csv").touch()
     joint = NAMED + '[motor.drive]\nnode_id = 1\n[link.encoder]\n[sim]\ncase = "constant"\n[bus]\n{}\n'
     texts = {
         "elbow": joint.format("elbow", ""), "wrist": joint.format("wrist", 'channel = "other"'),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import re
@@ -12,6 +13,7 @@ from pathlib import Path
 import joints
 import numpy as np
 import pytest
+from rich.console import Console
 
 import drivelink
 from drivelink import cli, jointfile
@@ -19,6 +21,7 @@ from drivelink.comparison import compare
 from drivelink.demo.simulate import alter, world_from_joint
 from drivelink.errors import DrivelinkError
 from drivelink.output.comparison import fits
+from drivelink.output.document import show
 from estimator import Effect, EstimatorError, JointModel, LinkDynamics, Motor, Record, Transmission
 from estimator.freerun import free_run, nrmse_fit
 from sim.world import record
@@ -45,7 +48,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_two_machines_differ_in_the_stiffness_and_each_model_fits_its_own(runs):
     made = compare(runs / "healthy.csv", runs / "soft.csv", ELBOW, horizon_s=1.0)
     stiffness, friction = made.differences()
-    assert "where they differ most" in repr(made) and len(repr(made)) < 5000
+    assert "Where the curves differ most" in repr(made) and len(repr(made)) < 5000
+    out = io.StringIO()
+    show(made.sections(), Console(file=out, width=80))
+    assert re.search(
+        r"│ friction +│ N·m +│ +\S+ │ +\S+ │ +\S+ rad/s │ +\S+ σ │\n", out.getvalue()
+    )  # no cell folds
     assert abs(stiffness.b / stiffness.a - 0.9) < 0.02
     assert abs(stiffness.b - stiffness.a) > 10.0 * stiffness.std > 0.0
     assert abs(friction.b - friction.a) < 5.0 * friction.std

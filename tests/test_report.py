@@ -82,7 +82,10 @@ def test_json_is_pure_and_a_page_without_a_curve_has_no_empty_section(folder, ca
     report = _diagnose(folder, "clean", "joint.toml", "--json")
     assert json.loads(capsys.readouterr().out) == report
     page = (folder / "clean-joint.toml" / "report.html").read_text(encoding="utf-8")
-    assert "What reveals it" not in page
+    assert "What reveals it" not in page and "What could not be separated" not in page
+    assert "<th>probability" not in page and not re.search(
+        r"e-\d", page[page.index("Error of") : page.index("<svg")]
+    )
 
 
 def test_the_report_is_self_contained_and_has_the_verdict_units_bands_the_winner_and_what_is_left(folder):
@@ -217,6 +220,17 @@ def test_thinning_loses_no_peak():
     _, (axes,) = new_figure()
     over_time(axes, {"a": PlotCurve(t, y)}, "y")
     assert len(axes.lines[0].get_xdata()) < 5000 and max(axes.lines[0].get_ydata()) == 7.0
+
+
+@pytest.mark.parametrize("n", [3000, 300_000])
+def test_no_curve_over_time_goes_on_where_samples_are_missing(n):
+    t = np.arange(n) * 1e-3
+    t[n // 3 :] += 2.0
+    _, (axes,) = new_figure()
+    over_time(axes, {"a": PlotCurve(t, np.sin(t), np.ones(n))}, "y")
+    x, y = axes.lines[0].get_data()
+    across = np.flatnonzero(np.isnan(x))
+    assert len(across) == 1 and np.isnan(y[across[0]]) and x[across[0] + 1] - x[across[0] - 1] > 2.0
 
 
 def test_what_is_not_finite_or_constant_or_empty_can_be_drawn(tmp_path):

@@ -195,11 +195,23 @@ def add_map(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def recording_path(text: str) -> Path:
+    """Return the path of a recording: a joint file in its place is the user's slip.
+
+    Raises:
+        argparse.ArgumentTypeError: it is a joint file's.
+    """
+    path = Path(text)
+    if path.suffix.lower() == ".toml":
+        raise argparse.ArgumentTypeError(f"{path} is a joint file: expected a recording (and --joint {path})")
+    return path
+
+
 def add_recordings(parser: argparse.ArgumentParser) -> None:
     """Add RECORDING, `--joint`, `--bandwidth-hz`, `--strict` and `--map`, for the verbs that fit."""
     parser.add_argument(
         "recording",
-        type=Path,
+        type=recording_path,
         nargs="+",
         metavar="RECORDING",
         help="recordings of one joint: CSV, MCAP, CAN log; each of several is validated by the others",

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from drivelink import analysis
-from drivelink.cli import add_number, add_recordings, conclude, require_distinct, warn, wrote
+from drivelink.cli import add_number, add_recordings, conclude, recording_path, require_distinct, warn, wrote
 from drivelink.errors import HarmfulModelError, UsageError
 from drivelink.files import check_target
 from drivelink.output.progress import Meter
@@ -30,7 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser)
     parser.add_argument(
         "--validate",
-        type=Path,
+        type=recording_path,
         metavar="RECORDING2",
         help="held-out data: an effect is kept only if it lowers the error there",
     )

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from drivelink.cli import add_map, add_number, warn
+from drivelink.cli import add_map, add_number, recording_path, warn
 from drivelink.files import check_target
 from drivelink.jointfile import JointFile
 from drivelink.output.progress import Meter
@@ -43,7 +43,7 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="the recording")
+    parser.add_argument("file", type=recording_path, metavar="FILE", help="the recording")
     parser.add_argument("--joint", type=Path, metavar="JOINT", help="joint file it was made with")
     parser.add_argument("--out", type=Path, metavar="CSV", help="write the estimates, a row for each cycle")
     parser.add_argument("--force", action="store_true", help="replace the CSV of --out if it exists")

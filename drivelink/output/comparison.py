@@ -126,7 +126,7 @@ class Comparison:
 
     def sections(self) -> list[Section]:
         """Return the page's sections."""
-        sections = [Section("curves", [self._differences()])]
+        sections = [Section("Where the curves differ most", [self._differences()])]
         for side, *runs in self.runs:
             sections.append(fits(dict(zip("AB", runs, strict=True)), side.name))
             charts: list[Any] = [
@@ -135,23 +135,25 @@ class Comparison:
                     partial(self._correlated, side, runs), "residual of that channel; bands: 95 % of chance"
                 ),
             ]
-            sections.append(Section(f"over {side.name}", charts))
+            sections.append(Section(f"Over {side.name}", charts))
         for motor in range(len(self.sides[0].model.motors)):
             charts = [
                 Chart(partial(self._curve, motor, kind)) for kind, of in self.curves(motor).items() if of
             ]
-            sections.append(Section(f"motor {motor + 1}", charts))
+            sections.append(Section(f"Motor {motor + 1}", charts))
         return sections
 
     def _differences(self) -> Grid:
         rows: Rows = []
         for one in self.differences():
             unit = self.units.shown("N·m/rad" if one.kind == "stiffness" else "N·m")
-            apart = f"{number(abs(one.b - one.a) / one.std, 2)} σ" if one.std > 0.0 else "–"
+            apart = f"{abs(one.b - one.a) / one.std:.1f} σ" if one.std > 0.0 else "–"
             at = f"{number(one.at, 3)} {self.units.shown('rad' if one.kind == 'stiffness' else 'rad/s')}"
             a, b = (value_and_interval(value, SIGMA_95 * one.std)[0] for value in (one.a, one.b))
-            rows.append((f"{one.kind}, motor {one.motor}", at, f"{a} {unit}", f"{b} {unit}", apart))
-        return Grid(("where they differ most", "at", "A", "B", "apart"), rows)
+            if (f"motor {one.motor}",) not in rows:
+                rows.append((f"motor {one.motor}",))
+            rows.append((one.kind, unit, a, b, at, apart))
+        return Grid(("", "unit", "A", "B", "at", "apart"), rows)
 
     def _over(self, side: Side, runs: Sequence[FreeRun]) -> Figure:
         run, j = runs[0], self.channel(runs[0])
@@ -208,7 +210,7 @@ def fits(runs: Mapping[str, FreeRun], of: str) -> Section:
         columns["at constant velocity"] = [_fit(fit) if not fit < 0.0 else "below 0 %" for fit in at_constant]
     rows: Rows = list(zip(map(_in_words, first.channels), *columns.values(), strict=True))
     heads = (f"fit of {of}", *columns)
-    return Section(f"free run, from measured states every {first.horizon_s:.3g} s", [Grid(heads, rows)])
+    return Section(f"Free run, from measured states every {first.horizon_s:.3g} s", [Grid(heads, rows)])
 
 
 def _fit(percent: float) -> str:
@@ -243,8 +245,7 @@ def beside(
     declared, found = Side("as declared", before, record), Side("as found", after, None)
     made = Comparison((declared, found), ((declared._replace(name=name), first, second),), units)
     about = Paragraph("A: the model as declared. B: with what was found.")
-    curves, *rest = made.sections()
-    return [Section("Model beside machine", [about, *curves.blocks]), *rest]
+    return [Section("Model beside machine", [about]), *made.sections()]
 
 
 def _in_words(channel: str) -> str:

@@ -103,8 +103,9 @@ def sections(
     made += [fits(*one) for one in zip(runs, names, strict=True)]
     made.append(Section("", [Lines(tuple(found.notes))]))
     if len(names) > 1:
+        unit = units.shown("N·m")
         each: Rows = [
-            (name, *(f"{left.rms_nm:.3g} {units.shown('N·m')}  {percent(left.relative, 2)}" for left in one))
+            (name, *(f"{number(left.rms_nm, 3)} {unit}  {percent(left.relative, 2)}" for left in one))
             for name, one in zip(names, found.recordings, strict=True)
         ]
         made.append(Section("error of the torque balance", [Grid(("recording", "fitted", "left out"), each)]))
@@ -146,7 +147,8 @@ def _remarks(one: TransmissionFit) -> list[str]:
         )
     if abs(one.coulomb_nm) > max(4.0 * one.nuisance_std["coulomb"], 0.01 * one.torque_rms_nm):
         remarks.append(
-            f"friction that the model lacks, about {one.coulomb_nm:.3g} N·m: `drivelink diagnose` names it"
+            f"friction that the model lacks, about {number(one.coulomb_nm, 3)} N·m: "
+            "`drivelink diagnose` names it"
         )
     return remarks
 

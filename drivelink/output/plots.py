@@ -96,8 +96,16 @@ def xy(axes: Axes, curves: Mapping[str, PlotCurve], x_label: str, y_label: str, 
 
 
 def over_time(axes: Axes, curves: Mapping[str, PlotCurve], y_label: str, title: str = "") -> None:
-    """Draw curves over time in seconds."""
-    xy(axes, curves, "time / s", y_label, title)
+    """Draw curves over time in seconds, with gaps where samples are missing."""
+    xy(axes, {name: _with_gaps(curve) for name, curve in curves.items()}, "time / s", y_label, title)
+
+
+def _with_gaps(curve: PlotCurve) -> PlotCurve:
+    """Return a curve that is broken where more than one of its samples is missing."""
+    apart = np.diff(curve.x)
+    gaps = 1 + np.flatnonzero(apart > 2.0 * np.median(apart)) if len(apart) else np.array([], dtype=int)
+    std = None if curve.std is None else np.insert(curve.std, gaps, np.nan)
+    return PlotCurve(np.insert(curve.x, gaps, np.nan), np.insert(curve.y, gaps, np.nan), std)
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -206,7 +214,8 @@ def _thinned(curve: PlotCurve) -> PlotCurve:
     base = np.arange(len(y)) * stretch
     low = base + np.argmin(np.where(np.isfinite(y), y, np.inf), axis=1)
     high = base + np.argmax(np.where(np.isfinite(y), y, -np.inf), axis=1)
-    keep = np.unique(np.minimum(np.concatenate((low, high)), n - 1))
+    gaps = np.flatnonzero(np.isnan(curve.x))
+    keep = np.unique(np.minimum(np.concatenate((low, high, gaps)), n - 1))
     return PlotCurve(curve.x[keep], curve.y[keep], None if curve.std is None else curve.std[keep])
 
 

@@ -27,7 +27,7 @@ from drivelink.output.document import (
     page,
     parameter_rows,
 )
-from drivelink.output.numbers import Units, in_words
+from drivelink.output.numbers import Units, in_words, number
 from drivelink.output.sentences import SURE, free_curve, others_of, sentence, title_of, unexplained
 from estimator.choices import choice
 from estimator.diagnosis import Curve, Diagnosis, Finding, StiffnessCurve
@@ -144,7 +144,7 @@ def sections(outcome: Diagnosis, units: Units) -> list[Section]:
         Section("Stiffness before and after", [_stiffness_chart(s, units) for s in outcome.stiffness], wide),
         Section("Parameters", [_parameters(outcome, units)], wide=False),
         Section("Where the candidates stood", _candidates(outcome), wide=False),
-        Section("What could not be separated, and what would separate it", [_doubts(outcome)]),
+        Section("What could not be separated, and what would separate it", _doubts(outcome)),
     ]
     if outcome.series is not None:
         measured = partial(_series_figure, outcome, units, {"measured": "torque_nm"}, "Measured torque")
@@ -158,7 +158,7 @@ def _errors(outcome: Diagnosis, units: Units) -> Grid:
     rows: Rows = []
     for name, one in (("training", outcome.train), ("validation", outcome.validation)):
         before, after = (
-            f"{rms:.4g} {unit}, {percent(relative, 2)}"
+            f"{number(rms)} {unit}, {percent(relative, 2)}"
             for rms, relative in (
                 (one.before_rms_nm, one.before_relative), (one.after_rms_nm, one.after_relative)
             )
@@ -176,8 +176,8 @@ def _parameters(outcome: Diagnosis, units: Units) -> Grid:
         rows += [(title_of(finding, outcome),)] if finding.parameters else []
         for name, value in finding.parameters.items():
             rows += parameter_rows(name, value, finding.std.get(name), units)
-    for number, one in enumerate(outcome.transmissions, start=1):
-        rows += [(f"motor {number}, refitted",)] if one.parameters else []
+    for k, one in enumerate(outcome.transmissions, start=1):
+        rows += [(f"motor {k}, refitted",)] if one.parameters else []
         for name, value in one.parameters.items():
             rows += parameter_rows(name, value, one.std[name], units)
     rows += [("corrected in the readings",)] if outcome.alignment else []
@@ -202,11 +202,12 @@ def _candidates(outcome: Diagnosis) -> list[Block]:
         p = others.get(rival.name) if mine is None else mine
         motor = f", motor {rival.motor + 1}" if rival.motor is not None and several else ""
         named = f"{'' if mine is None else '▶ '}{in_words(rival.name)}{motor}"
-        chance = "" if not chances else f"< {choice('even'):g}" if p is None else f"{p:.2f}"
+        chance = (f"< {choice('even'):g}" if p is None else f"{p:.2f}",) if chances else ()
         left = Share(percent(rival.error_relative, 2), rival.error_relative / most)
-        rows.append((named, chance, left))
+        rows.append((named, *chance, left))
+    head = ("candidate", *(("probability",) if chances else ()), "error left with it alone")
     return [
-        Grid(("candidate", "probability", "error left with it alone"), rows),
+        Grid(head, rows),
         Paragraph(_choice_of(outcome, [r.error_relative for r in shown if (r.name, r.motor) in chances])),
     ]
 
@@ -307,7 +308,7 @@ def _series_figure(outcome: Diagnosis, units: Units, names: Mapping[str, str], t
     return figure
 
 
-def _doubts(outcome: Diagnosis) -> Lines:
+def _doubts(outcome: Diagnosis) -> list[Block]:
     lines = [
         f"{title_of(f, outcome)}, probability {f.probability:.2f}, could also be: {others_of(f)}."
         for f in outcome.effects
@@ -317,5 +318,6 @@ def _doubts(outcome: Diagnosis) -> Lines:
     if outcome.verdict == "insufficient_excitation" or any(f.alternatives for f in outcome.effects):
         lines.append("drivelink diagnose --motion next.csv designs a motion that tells them apart")
     lines += outcome.notes
-    other = "No other effect" if outcome.effects else "No effect"
-    return Lines(tuple(lines) or (f"{other} explains these data as well.",))
+    if outcome.effects and not lines:
+        lines.append("No other effect explains these data as well.")
+    return [Lines(tuple(lines))] if lines else []

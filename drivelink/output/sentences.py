@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivelink.output.numbers import Units, in_words
+from drivelink.output.numbers import Units, in_words, number
 from estimator.diagnosis import Curve, Diagnosis, Finding
 from estimator.reasons import percent
 
@@ -66,7 +66,7 @@ def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
     unit = (units or Units(False)).shown("N·m")
     left = outcome.validation
     share = percent(left.after_relative, 2)
-    text = f"{share} of the torque ({left.after_rms_nm:.3g} {unit} rms) stays unexplained"
+    text = f"{share} of the torque ({number(left.after_rms_nm, 3)} {unit} rms) stays unexplained"
     if outcome.verdict == "unexplained":
         free = (
             "a free curve, which has no name in the library" if free_curve(outcome) else "whatever was tried"

@@ -194,6 +194,18 @@ def test_recordings_come_over_http_and_an_mcap_brings_its_joint(fleet, joints, t
     assert "127.0.0.1" in lost["error"]
 
 
+def test_nights_that_failed_alike_are_each_a_recording(joints, tmp_path):
+    for day in (7, 8):
+        (tmp_path / f"elbow-2026-01-0{day}.csv").write_text("nothing")
+    found, _ = storage.find([str(tmp_path)])
+    with FleetTable(Store(str(tmp_path / "out"))) as kept:
+        for one in found:
+            (row,) = task.process(task.Task(source=one, version=__version__), joints).rows
+            assert not kept.has_now(row["digest"], row["joint"])
+            kept.append([row])
+    assert [row["time"].day for row in read_rows(Store(str(tmp_path / "out")))] == [7, 8]
+
+
 # Joints and times
 
 

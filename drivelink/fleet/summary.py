@@ -180,8 +180,8 @@ def _joint(name: str, rows: list[dict[str, Any]], judged: _Judged) -> dict[str, 
     }
 
 
-STATES = {"changing": 5.0, "lost": 4.0, "finding": 3.0, "unread": 2.0, "undecided": 1.0, "steady": 0.0}
-LOOK = ("changing", "lost", "finding", "unread")  # those that need a look
+STATES = {"lost": 5.0, "changing": 4.0, "finding": 3.0, "unread": 2.0, "undecided": 1.0, "steady": 0.0}
+LOOK = ("lost", "changing", "finding", "unread")  # those that need a look
 
 
 def _state(judged: _Judged, last: dict[str, Any] | None, gone: list[dict[str, Any]]) -> tuple[str, float]:
@@ -190,10 +190,10 @@ def _state(judged: _Judged, last: dict[str, Any] | None, gone: list[dict[str, An
     moved += [c["share"] for one in judged["parameters"] for c in one["changes"]]
     new = [e for e in judged["effects"] if e["significant"]]
     moved += [abs(e["error_before_relative"] - e["error_after_relative"]) for e in new]
-    if moved:
-        return "changing", max(moved)
     if gone:
         return "lost", 0.1 * len(gone)
+    if moved:
+        return "changing", max(moved)
     if last is None:
         return "unread", 0.0
     if last["verdict"] not in _NO_PLACE:

@@ -175,7 +175,7 @@ def process(task: Task, joints: Joints) -> Outcome:
                     f"expected drivelink {task.version} on worker {socket.gethostname()}, got {__version__}"
                 )
             with fetched(task.source) as (path, digest):
-                row["digest"], where = digest, str(path)  # a copy, where it comes from elsewhere
+                where = str(path)  # a copy, where it comes from elsewhere
                 joint = joints.of(path, task.source.url)
                 row |= {"joint": joint.name, "accepted_model": joint.digest}
                 if (digest, joint.name) in task.done:
@@ -183,7 +183,7 @@ def process(task: Task, joints: Joints) -> Outcome:
                 row["time"] = recorded_time(path, task.source, joint.file)
                 if task.since and row["time"] and row["time"] < task.since:
                     return Outcome("early", [], [], [])
-                rows, reports = _results(task, joint, path, row)
+                rows, reports = _results(task, joint, path, row | {"digest": digest})
         except (DrivelinkError, EstimatorError, OSError) as error:
             line = str(error).replace(f"{where}: ", "").replace(f"{task.source.url}: ", "")
             return _broken(row, line, notes, begin)
@@ -198,7 +198,7 @@ def process(task: Task, joints: Joints) -> Outcome:
 
 
 def broken_row(task: Task, error: str) -> dict[str, Any]:
-    """Return the row of a recording that could not be read."""
+    """Return the row of a recording that could not be read: each is one, also where nights failed alike."""
     time_ = named_time(task.source) or task.source.modified
     place = f"{task.source.url}|{task.source.size}|{task.source.stamp}"
     return {
@@ -219,8 +219,6 @@ def broken_row(task: Task, error: str) -> dict[str, Any]:
 
 def _broken(row: dict[str, Any], error: str, notes: list[str], begin: float) -> Outcome:
     line = " ".join(error.split())
-    if not row["digest"].startswith("unread-"):
-        row["id"] = f"{row['digest'][:24]}-{row['joint'] or ''}"
     return Outcome("error", [row | {"error": line, "cpu_s": time.process_time() - begin}], [], notes)
 
 

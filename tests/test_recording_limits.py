@@ -7,7 +7,7 @@ import re
 import struct
 import time
 import zlib
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import can
@@ -20,7 +20,7 @@ from fuzzparsers import JOINT, RECORDINGS, TEXT, frames, held, read_every_way, w
 from drivelink.canopen.eds import load_eds
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import ZenohSection, load
-from drivelink.recording import canframes, read
+from drivelink.recording import canframes, mcapfile, read
 from drivelink.recording.canlog import CAN_FORMATS, read_frames
 from drivelink.recording.corrections import Gathered
 from drivelink.recording.formats import FORMATS, open_sink
@@ -295,6 +295,27 @@ def test_equal_frames_of_a_joint_at_rest_are_parsed_once(tmp_path, monkeypatch):
     texts = [("can", stamp, f'{{"id":{i},"data":"{d.hex()}","rest":1}}'.encode()) for stamp, i, d in at_rest]
     assert len(read(mcap_of(tmp_path / "r.mcap", texts), JOINT)) == 2000
     assert len(parsed) == 3
+
+
+def test_estimates_of_no_samples_are_not_read_to_their_end(tmp_path, monkeypatch):
+    parsed = []
+    monkeypatch.setattr(mcapfile, "message_fields", lambda text: parsed.append(1) or message_fields(text))
+    estimates = [("estimate", k, b'{"sequence":%d,"status":3}' % k) for k in range(60_000)]
+    path = mcap_of(tmp_path / "r.mcap", estimates)
+    with one_line("no samples in it"):
+        list(open_playback(path, JOINT, tmp_path))
+    assert len(parsed) < 40_000
+
+
+def test_frames_are_the_same_whether_drivelink_or_another_tool_wrote_them(tmp_path):
+    for data, wrong in (("", 0), ("00ff", 0), ("0", 1), ("00" * 65, 1)):
+        for text in ('{"id":%d,"data":"%s"}', '{ "data": "%s", "id": %d }'):
+            for can_id in (0, 0x7FF, 0x800):
+                words = (can_id, data) if text.index("id") < 5 else (data, can_id)
+                path = mcap_of(tmp_path / "r.mcap", [("can", 1, (text % words).encode())])
+                with nullcontext() if not wrong and can_id <= 0x7FF else one_line("no frame of drivelink"):
+                    (frame,) = canframes._mcap_frames(path)
+                    assert frame == (1, can_id, bytes.fromhex(data), "")
 
 
 def test_frames_without_end_are_neither_held_nor_read(tmp_path):

@@ -300,6 +300,8 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
         if (before := waiting.get(number)) is not None:
             sample, flags = sample or before.sample, flags | before.flags
         waiting[number] = Cycle(sequence, message.log_time_ns, sample, flags)
+        if not found and len(waiting) > MAX_UNREAD:
+            break  # estimates of nothing
         if len(waiting) > most:
             yield from _released(waiting, min(newest.values()) if len(newest) > 1 else (0, 0))
             most = 2 * len(waiting) + _FEW

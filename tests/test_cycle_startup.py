@@ -170,6 +170,18 @@ def test_jitter_lost_syncs_and_stalls_are_no_other_period(lost):
         assert measure_period(sorted(stamps)[:64], 0.001)[:2] == (0.001, True)
 
 
+def test_syncs_that_are_mostly_read_in_bursts_are_no_other_period():
+    """Their median step is that of a burst."""
+    kept = 0
+    for seed in range(200):
+        rng, free, stamps = random.Random(seed), 0.0, []
+        for k in range(64):
+            free = max(free, k + rng.uniform(0.0, 0.05)) + (rng.random() < 0.1) * rng.uniform(2.5, 7.5) + 0.02
+            stamps.append(round(free * MS))
+        kept += measure_period(stamps, 0.001).same
+    assert kept >= 150
+
+
 def test_a_jitter_of_a_fifth_of_a_period_and_lost_syncs_are_no_other_period():
     kept = 0
     for seed in range(60):

@@ -61,7 +61,9 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
         return None
     spread = float(np.median(np.abs(gaps - period_s))) / period_s
     steady = spread < _STEADY and abs(period_s - expected_s) <= _SAME * expected_s
-    if steady or (0.5 < period_s / expected_s < 1.5 and _agree(stamps / expected_s)):
+    # Not the median step: where most were read in bursts, that is short.
+    fast = stamps[-1] < 0.5 * expected_s * gaps.size
+    if steady or (period_s < 1.5 * expected_s and not fast and _agree(stamps / expected_s)):
         return MeasuredPeriod(expected_s, True, spread <= _JITTERY)
     if spread > _JITTERY:
         # A step of nearly two periods may be jitter; only larger ones count as lost.

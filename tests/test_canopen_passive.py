@@ -4,7 +4,7 @@ from canopenkit import eds_text, joint_text, signals
 from drivelink._core import Assembler
 from drivelink.canopen.layout import Signal
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.canopen.sdo_sniffer import SdoSniffer
+from drivelink.canopen.sdo_sniffer import SdoSniffer, written_object
 from drivelink.cycle.following import PassiveFollower
 from drivelink.errors import DriveError
 from drivelink.jointfile import parse
@@ -70,6 +70,13 @@ def test_a_download_counts_only_when_the_node_confirms_it():
     assert listener.values == {}
     assert heard(refused, listener=listener).values == {}
     assert heard(write, done).values == {(0x1017, 0): 100}
+
+
+def test_frames_of_fewer_than_eight_bytes_count_as_some_nodes_take_them():
+    listener = heard(">2f001a0000", "<60001a00")
+    assert listener.values == {(0x1A00, 0): 0} and listener.written
+    assert written_object(bytes.fromhex("2310100173")) == (0x1010, 1)
+    assert written_object(b"") is None and heard("<", ">", ">40", listener=listener).unasked == 0
 
 
 def test_segmented_transfers_are_followed_both_ways():

@@ -78,9 +78,8 @@ class SdoSniffer:
 
     def request(self, data: bytes, now_s: float) -> None:
         """Process a frame of the master, 0x600 + node."""
-        if len(data) != 8:
-            return
-        if self._goes_on(data, now_s):
+        data = _padded(data)
+        if not data or self._goes_on(data, now_s):
             return
         command, transfer = data[0] >> 5, self._transfer
         self._blocks = command > _ABORT
@@ -102,8 +101,8 @@ class SdoSniffer:
 
     def response(self, data: bytes, now_s: float) -> tuple[Address, bytes] | None:
         """Process a frame of the node, 0x580 + node; return the object of interest that it ends to read."""
-        transfer = self._transfer
-        if len(data) != 8 or self._blocks:
+        transfer, data = self._transfer, _padded(data)
+        if not data or self._blocks:
             return None
         if transfer is None or now_s - transfer.asked_s > self._timeout_s or not _names(transfer, data):
             self.unasked += 1
@@ -174,8 +173,14 @@ def is_mapping(address: Address) -> bool:
 
 def written_object(data: bytes) -> Address | None:
     """Return the object that a frame of the master begins to write."""
-    begins = len(data) == 8 and (data[0] >> 5 == _DOWNLOAD or data[0] & 0xE1 == _BLOCK_DOWNLOAD << 5)
+    data = _padded(data)
+    begins = data and (data[0] >> 5 == _DOWNLOAD or data[0] & 0xE1 == _BLOCK_DOWNLOAD << 5)
     return _address(data) if begins else None
+
+
+def _padded(data: bytes) -> bytes:
+    """The eight bytes of a frame, of which some nodes take fewer; empty: it is none of SDO."""
+    return data.ljust(8, b"\0") if 0 < len(data) <= 8 else b""
 
 
 def _begun(data: bytes, now_s: float) -> _Transfer:

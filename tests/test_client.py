@@ -295,7 +295,7 @@ def test_a_name_without_daemon_is_said_once_with_the_nearest_one(publisher, endp
             while not caplog.messages and time.monotonic() < end:
                 joint.wait(timeout_s=0.4) if how == "wait" else (joint.latest(), time.sleep(0.01))
             joint.wait(timeout_s=0.1)
-    assert caplog.messages == ['no daemon of "elbwo"; did you mean "elbow"? there is elbow']
+    assert caplog.messages == ['no daemon of "elbwo"; did you mean "elbow"?']
 
 
 def test_a_daemon_that_is_there_is_listed_and_not_missed(publisher, endpoint, hasty, caplog, capsys):

@@ -240,6 +240,9 @@ def test_a_person_sees_where_the_joint_is_and_goes_and_a_program_its_phases(monk
         printed = capsys.readouterr().out
         assert printed.startswith(expected) and printed.count("\n") == (1 if as_json else 2)
         assert as_json or " N·m/rad, motors " in printed
+    unknown = estimate(400, 0)._replace(stiffness_nm_rad=math.nan)
+    controller.step(0.4, Cycle(unknown, sample(400)), enabled=True, faulted=False)
+    assert " rad, stiffness – N·m/rad" in str(controller)
     controller.phase = "run"
     assert " (to +0.00) rad, stiffness " in str(controller)
 

@@ -131,7 +131,7 @@ def live(change=lambda text: text, seconds=5.0):
 @pytest.mark.parametrize(
     ("old", "new", "said", "line"),
     [
-        ("", "", "units and signs of positions and torque agree", ""),
+        ("", "", "no unit or sign of positions and torque looks wrong", ""),
         ("torque_constant_nm_a = 0.05", 'torque_constant_nm_a = 50.0\ntorque_source = "current"',
          "the motor torque looks like N·mm", "motor[1].drive.torque_constant_nm_a = 0.05"),
     ],
@@ -142,6 +142,12 @@ def test_a_moving_joint_passes_the_gate_of_recordings_and_a_fault_is_named_with_
     (finding,) = live(lambda text: text.replace(old, new, 1)).notices
     assert finding.severity is (Severity.ERROR if line else Severity.OK), finding
     assert said in finding.text and line in (finding.fix or "")
+
+
+def test_where_samples_are_lost_what_seems_right_is_no_verdict(monkeypatch):
+    monkeypatch.setattr("drivelink.doctor.motion._busy", lambda _: True)
+    (finding,) = live().notices
+    assert finding.severity is Severity.INFO and finding.fix.startswith("this machine is too busy")
 
 
 def test_too_short_a_look_and_a_joint_at_rest_are_no_judgement():

@@ -279,7 +279,7 @@ def test_a_joint_that_nobody_serves_is_not_live_and_the_nearest_is_named(daemon,
     )
     displayed = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert displayed["joint"] == "elbwo" and not displayed["live"] and "estimate" not in displayed
-    assert displayed["state"] == 'no daemon of "elbwo"; did you mean "elbow"? there is elbow'
+    assert displayed["state"] == 'no daemon of "elbwo"; did you mean "elbow"?'
 
 
 def test_a_live_view_needs_a_terminal_with_its_characters():

@@ -49,7 +49,7 @@ def judge_record(section: Section, joint: JointFile, record: Record | None) -> N
 
 def _advice(record: Record) -> str:
     """Return what would decide what could not be decided."""
-    if len(record) < (1.0 - _MOST_LOST) * (record.sequence[-1] - record.sequence[0] + 1):
+    if _busy(record):
         return _LOST
     for position in record.motor_position_rad.T:
         steps = np.abs(np.diff(position))
@@ -57,6 +57,11 @@ def _advice(record: Record) -> str:
         if np.ptp(position) > _LEAST_COUNTS * count:
             return _MOVING
     return _STILL
+
+
+def _busy(record: Record) -> bool:
+    """Return whether so many samples are missing that what is left says little."""
+    return len(record) < (1.0 - _MOST_LOST) * (record.sequence[-1] - record.sequence[0] + 1)
 
 
 def _report_judgement(section: Section, joint: JointFile, judgement: Judgement, record: Record) -> None:
@@ -74,8 +79,11 @@ def _report_judgement(section: Section, joint: JointFile, judgement: Judgement, 
         section.info(joint.name, judgement.remark, fix)
     else:
         left = percent(judgement.left, 1)
-        text = f"units and signs of positions and torque agree: the torque balance leaves {left}"
-        section.ok(joint.name, text)
+        text = f"no unit or sign of positions and torque looks wrong: the torque balance leaves {left}"
+        if _busy(record):
+            section.info(joint.name, text, _LOST)
+        else:
+            section.ok(joint.name, text)
 
 
 def judge_motion(section: Section, survey: NodeSurvey, readings: Readings) -> bool:

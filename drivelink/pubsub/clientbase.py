@@ -72,7 +72,9 @@ def absent(joint: str, names: Sequence[str]) -> str:
     if not names:
         return f'no daemon of "{joint}", nor of any other joint: drivelink run JOINT starts one'
     near = difflib.get_close_matches(joint, names, n=1, cutoff=0.5)
-    guess = f'; did you mean "{near[0]}"?' if near else ""
+    guess = f'; did you mean "{clean_text(near[0], _MOST)}"?' if near else ""
+    if near and len(names) == 1:
+        return f'no daemon of "{joint}"{guess}'
     shown = ", ".join(clean_text(name, _MOST) for name in names[:_SHOWN])
     return f'no daemon of "{joint}"{guess or ";"} there is {shown}{", …" if len(names) > _SHOWN else ""}'
 

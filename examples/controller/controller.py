@@ -97,6 +97,7 @@ class Controller:
             return "no estimate yet"
         estimate, (_, (q_d, sigma_d)) = self._cycle.estimate, self._way
         q, sigma = f"{self._cycle.sample.link_position_rad:+.3f}", f"{estimate.stiffness_nm_rad:.3f}"
+        sigma = sigma.replace("nan", "–")
         if self.phase in ("run", "react"):
             q, sigma = f"{q} (to {q_d:+.2f})", f"{sigma} (to {sigma_d:.2f})"
         torques = " ".join(f"{torque:+.3f}" for torque in self._last)

@@ -216,7 +216,7 @@ def test_an_unusable_stiffness_is_no_point_of_the_trend_but_a_cross_on_the_chart
     assert [one["reason"] for one in joint["unusable"]] == [
         "the fitted stiffness is not above zero", "its motion does not reveal the stiffness",
     ]  # fmt: skip
-    assert page(document).count('class="cross"') == 4  # on the chart, and in the list
+    assert page(document).count('class="cross"') == 6  # on the chart, also a phone's, and in the list
 
 
 def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_chart():
@@ -230,10 +230,13 @@ def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_cha
     assert joint["sentence"] == "The last 3 recordings show no stiffness, from 2026-01-13 on: no frames."
     text = page(document)
     assert "<h1>1 of 1 joint needs a look: 1 lost</h1>" in text
-    assert text.count('class="found"') == 2 and "134 → 2.00 % of the torque" in text
+    assert text.count('class="found"') == 4 and "134 → 2.00 % of the torque" in text
 
 
 CUT = "[...document.querySelectorAll('figure, .table')].filter(e => e.scrollWidth > e.clientWidth).length"
+
+SMALLEST = """Math.min(...[...document.querySelectorAll('.large text')].filter(e => e.getClientRects().length)
+.map(e => parseFloat(getComputedStyle(e).fontSize) * e.getScreenCTM().a))"""
 
 SHOWN = """[...document.querySelectorAll('.joints tr')].filter(row => row.offsetHeight)
 .sort((a, b) => a.offsetTop - b.offsetTop).map(row => row.querySelector('th').textContent)"""
@@ -250,6 +253,7 @@ def test_a_phone_shows_charts_and_tables_whole_and_joints_are_sorted_and_hidden(
         browser.resize(390, 800)
         browser.open((tmp_path / "fleet.html").as_uri())
         assert browser.evaluate(CUT) == 0
+        assert browser.evaluate(SMALLEST) > 8.0  # letters that can be read
         assert browser.evaluate(SHOWN) == ["wrist", "elbow"]  # by urgency
         browser.evaluate("document.getElementById('by1').click()")
         assert browser.evaluate(SHOWN) == ["elbow", "wrist"]  # by name

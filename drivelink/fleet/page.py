@@ -184,12 +184,7 @@ def _small(joint: dict[str, Any], one: dict[str, Any]) -> str:
 
 
 def _figure(joint: dict[str, Any], one: dict[str, Any]) -> str:
-    frame = _frame(joint, one, _LEFT, _WIDTH - _LEFT - _RIGHT, _HEIGHT)
-    rows = joint["effects"]
-    height = _HEIGHT + _ROW * len(rows) + 22.0
-    parts = [_axes(frame, height), _bands(one, frame), _fitted(one, frame), _points(one, frame)]
-    parts.append(_missing(joint, one, frame))
-    parts += [_strip(joint, effect, frame, _HEIGHT + _ROW * (k + 0.8)) for k, effect in enumerate(rows)]
+    charts = _chart(joint, one, _WIDTH, "wide") + _chart(joint, one, 0.5 * _WIDTH, "narrow")
     several = f" of motor {one['transmission']}" if len(joint["transmissions"]) > 1 else ""
     caption = (
         f"Stiffness{several} at a deflection of {one['deflection_rad']:.3g} "
@@ -197,11 +192,18 @@ def _figure(joint: dict[str, Any], one: dict[str, Any]) -> str:
         f"{100 * one['scatter_relative']:.2g} %, q = {one['q_value']:.2g}. × at the bottom: a recording that "
         "shows no stiffness. A click opens the diagnosis."
     )
-    body = "".join(parts)
-    return (
-        f'<figure class="large"><svg viewBox="0 0 {_WIDTH:g} {height:g}" role="img">{body}</svg>'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
-    )
+    return f'<figure class="large">{charts}<figcaption>{html.escape(caption)}</figcaption></figure>'
+
+
+def _chart(joint: dict[str, Any], one: dict[str, Any], width: float, name: str) -> str:
+    """Chart of the stiffness over time, for a screen or for a phone."""
+    frame = _frame(joint, one, _LEFT, width - _LEFT - _RIGHT, _HEIGHT)
+    rows = joint["effects"]
+    height = _HEIGHT + _ROW * len(rows) + 22.0
+    parts = [_axes(frame, height), _bands(one, frame), _fitted(one, frame), _points(one, frame)]
+    parts.append(_missing(joint, one, frame))
+    parts += [_strip(joint, effect, frame, _HEIGHT + _ROW * (k + 0.8)) for k, effect in enumerate(rows)]
+    return f'<svg class="{name}" viewBox="0 0 {width:g} {height:g}" role="img">{"".join(parts)}</svg>'
 
 
 def _missing(joint: dict[str, Any], one: dict[str, Any], frame: _Frame, *, linked: bool = True) -> str:

@@ -145,7 +145,7 @@ def _bus_wanted(sink: Sink, source: str, alive: bool, joint: JointFile) -> bool:
         if needed:
             raise UsageError(
                 'bus.interface = "virtual" exists inside one process only: nothing else can listen'
-                ": record samples (.mcap, .csv) from the daemon"
+                ": record samples (.mcap, .csv) from the daemon, or give the --interface it was given"
             )
         return False
     return needed or not alive or "frame" in sink.wants

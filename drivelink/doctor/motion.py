@@ -61,7 +61,7 @@ def _advice(record: Record) -> str:
 
 def _busy(record: Record) -> bool:
     """Return whether so many samples are missing that what is left says little."""
-    return len(record) < (1.0 - _MOST_LOST) * (record.sequence[-1] - record.sequence[0] + 1)
+    return len(record) < (1.0 - _MOST_LOST) * int(record.sequence[-1] - record.sequence[0] + 1)
 
 
 def _report_judgement(section: Section, joint: JointFile, judgement: Judgement, record: Record) -> None:

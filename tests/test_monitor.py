@@ -24,7 +24,7 @@ from drivelink.monitor.statuslines import shape, status_lines
 from drivelink.monitor.terminal import can_draw, joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.web import snapshot
-from drivelink.output.numbers import axis_labels, number, with_interval
+from drivelink.output.numbers import among, axis_labels, number, with_interval
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
@@ -204,6 +204,27 @@ def test_numbers_are_short_and_their_digits_follow_the_uncertainty(value, half, 
 )  # fmt: skip
 def test_the_labels_of_an_axis_have_one_power_of_ten_and_digits_of_their_distance(values, labels):
     assert " ".join(axis_labels(values)) == labels
+
+
+@pytest.mark.parametrize(
+    ("value", "largest", "text"),
+    [
+        (0.0376, 0.1, "0.0376"), (2.1e-4, 0.1, "0.0002"), (-4e-6, 0.25, "0.0000"), (-6.242, 8.0, "−6.242"),
+        (2e-5, 4e-4, "0.200e−4"), (math.nan, 1.0, "–"), (2e-4, math.nan, "2.000e−4"),
+    ],
+)  # fmt: skip
+def test_a_value_of_a_series_has_the_digits_of_its_largest(value, largest, text):
+    assert among(value, largest) == text
+
+
+def test_a_torque_or_deflection_that_passes_zero_does_not_change_its_notation():
+    view = filled(truth=True)
+    one = TransmissionEstimate(2.1e-4, 100.0, 2.0, -3e-5)
+    view.update(Estimate(5000, 3, 2.1e-4, 200.0, 4.0, (one, one)), 5.0, Truth(2e-4, 200.0))
+    table = Console(width=120, record=True, file=io.StringIO())
+    table.print(joints_table({"elbow": view}, 120))
+    for text in ("\n".join(lines(view)), view.line(), table.export_text()):
+        assert "e−" not in text and "0.0000" in text  # the deflection
 
 
 def test_an_error_of_the_valid_cycles_does_not_stand_beside_an_estimate_that_is_not():

@@ -156,6 +156,12 @@ def test_what_is_not_valid_is_shown_grey_with_the_reason_and_sets_no_scale():
     assert (title, style) == ("not valid · elbow · drivelink", "past")
 
 
+def test_a_torque_or_deflection_that_passes_zero_does_not_change_its_notation():
+    view, one = fed(), (TransmissionEstimate(2.1e-4, 100.0, 1.0, -3e-6),)
+    view.update(Estimate(4100, 3, 2.1e-4, 100.0, 1.0, one), 4.1)
+    assert page("take(sent[0]); return [shown('torque'), shown('deflection')];", view) == ["0.000", "0.00000"]
+
+
 def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers():
     gone = fed()
     gone.gone, gone.silent_s = True, 12.0

@@ -82,6 +82,11 @@ class GrowingCurve:
             self._width *= 2.0
             self._places = {place // 2: point for place, point in self._places.items()}
 
+    @property
+    def reach_rad(self) -> float:
+        """Largest deflection of its points; 0 without one."""
+        return max((abs(point[0]) for point in self._places.values()), default=0.0)
+
     def points(self) -> list[tuple[float, float, float]]:
         """Return the (deflection, stiffness, standard deviation), by deflection.
 
@@ -198,6 +203,17 @@ class JointHistory:
         """Enter the present residual over its baseline."""
         if self.moments and math.isfinite(ratio):
             self.residuals.append((self.moments[-1].time_s, ratio))
+
+    @property
+    def largest_torque_nm(self) -> float:
+        """Largest flexibility torque of the window, which says how many digits a small one has."""
+        known = [abs(m.torque_nm) for m in self.window() if math.isfinite(m.torque_nm)]
+        return max(known, default=math.nan)
+
+    @property
+    def largest_deflection_rad(self) -> float:
+        """Largest deflection that was seen."""
+        return max((curve.reach_rad for curve in (*self.curves, *self.doubtful)), default=math.nan)
 
     def window(self) -> list[Moment]:
         """Return the moments within `seconds` of the last one."""

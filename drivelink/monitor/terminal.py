@@ -18,7 +18,7 @@ from rich.text import Text
 
 from drivelink.monitor.braille import sparkline
 from drivelink.monitor.view import ESTIMATE, JointView, half_interval
-from drivelink.output.numbers import number, value_and_interval
+from drivelink.output.numbers import among, value_and_interval
 
 
 def joints_table(views: Mapping[str, JointView], width: int) -> Table:
@@ -40,11 +40,10 @@ def joints_table(views: Mapping[str, JointView], width: int) -> Table:
         if estimate is None:
             cells += [Text("–")] * (len(table.columns) - 2) + [Text(view.state or "–")]
         else:
-            deflection = " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions)
             value, half = value_and_interval(estimate.stiffness_nm_rad, half_interval(estimate))
             cells.append(Text.assemble((value, ink), f" ± {half}" if half else ""))
-            cells.append(Text(number(estimate.flexibility_torque_nm)))
-            cells += [Text(deflection)] if width >= 80 else []
+            cells.append(Text(among(estimate.flexibility_torque_nm, view.history.largest_torque_nm)))
+            cells += [Text(view.deflections(" "))] if width >= 80 else []
             if sparks >= 8:
                 series = [m.stiffness_nm_rad if m.valid else math.nan for m in view.history.window()]
                 cells.append(Text(sparkline(series, sparks), style=ink))

@@ -22,7 +22,7 @@ from rich.text import Text
 from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import JointHistory, TruePoint, model_curves, usual_range
 from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_lines, status_text
-from drivelink.output.numbers import number, value_and_interval, with_interval
+from drivelink.output.numbers import among, number, value_and_interval, with_interval
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from estimator.sample import SIGMA_95, Status
 
@@ -134,9 +134,9 @@ class JointView:
         parts = [
             f"{self.name}:",
             f"stiffness {with_interval(estimate.stiffness_nm_rad, half_interval(estimate), 'N·m/rad')},",
-            f"torque {number(estimate.flexibility_torque_nm)} N·m,",
+            f"torque {self._torque(estimate.flexibility_torque_nm)} N·m,",
             *self._external_words(),
-            "deflection " + " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions),
+            f"deflection {self.deflections(' ')}",
             "rad, " + ", ".join(text for text, _ in self.flags),
         ]
         if math.isfinite(self.errors[0]):
@@ -144,6 +144,14 @@ class JointView:
         if self.status:
             parts[-1] += f", {status_text(self.status, self.model, self.finding)}"
         return " ".join(parts)
+
+    def _torque(self, value_nm: float) -> str:
+        return among(value_nm, self.history.largest_torque_nm)
+
+    def deflections(self, between: str) -> str:
+        """Return the deflection of each transmission now."""
+        ones = self.history.latest.transmissions if self.history.latest else ()
+        return between.join(among(one.deflection_rad, self.history.largest_deflection_rad) for one in ones)
 
     def _external_words(self) -> list[str]:
         touch = self.history.touch
@@ -198,7 +206,7 @@ class JointView:
         for label, value, extra, unit, true, error, series in (
             ("stiffness", stiffness, band, "N·m/rad", last.true_stiffness_nm_rad, self.errors[0],
              [m.stiffness_nm_rad if m.valid else math.nan for m in window]),
-            ("torque", number(last.torque_nm), "", "N·m", last.true_torque_nm, self.errors[1],
+            ("torque", self._torque(last.torque_nm), "", "N·m", last.true_torque_nm, self.errors[1],
              [m.torque_nm if m.valid else math.nan for m in window]),
         ):  # fmt: skip
             table.add_row(
@@ -206,7 +214,7 @@ class JointView:
                 Text.assemble((value, f"bold {ink}"), extra, f" {unit}"),
                 Text.assemble(
                     "truth ",
-                    (number(true), TRUTH),
+                    (number(true) if label == "stiffness" else self._torque(true), TRUTH),
                     f"  rms error {100 * error:.2f} %" if last.valid and math.isfinite(error) else "",
                 )
                 if known
@@ -214,8 +222,9 @@ class JointView:
                 Text(sparkline(series, spark), style=ink),
             )
         self._add_external(table, spark, ink)
-        deflection = "   ".join(number(one.deflection_rad, 4) for one in estimate.transmissions)
-        table.add_row("deflection", f"{deflection} rad", self._each(estimate) if not known else "", "")
+        table.add_row(
+            "deflection", f"{self.deflections('   ')} rad", self._each(estimate) if not known else "", ""
+        )
         return table
 
     def _add_external(self, table: Table, spark: int, ink: str) -> None:

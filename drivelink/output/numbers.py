@@ -23,11 +23,22 @@ def number(value: float, digits: int = 4) -> str:
 def axis_labels(values: Sequence[float]) -> list[str]:
     """Return the labels of an axis' even places: one power of ten, and two digits of their distance."""
     largest, apart = max(map(abs, values)), abs(values[1] - values[0])
+    return [_to_place(value, largest, math.floor(math.log10(apart)) - 1) for value in values]
+
+
+def among(value: float, largest: float, digits: int = 4) -> str:
+    """Return one of a series of values to the last digit that the largest has: 0.0376, 0.0002."""
+    if not (math.isfinite(value) and math.isfinite(largest) and largest > 0.0):
+        return number(value, digits)
+    return _to_place(value, largest, math.floor(math.log10(largest)) + 1 - digits)
+
+
+def _to_place(value: float, largest: float, last: int) -> str:
+    """Return a value to a place, by its power of ten, in the notation that the largest of its kind has."""
     power = 0 if 1e-3 <= largest < 1e5 else math.floor(math.log10(largest))
-    decimals = max(0, power + 1 - math.floor(math.log10(apart)))
-    texts = [f"{value / 10.0**power:.{decimals}f}" for value in values]
-    texts = [text.removeprefix("-") if not text.strip("-0.") else text for text in texts]
-    return [f"{text}e{power}".replace("-", "−") if power else text.replace("-", "−") for text in texts]
+    text = f"{value / 10.0**power:.{max(0, power - last)}f}"
+    text = text.removeprefix("-") if not text.strip("-0.") else text
+    return f"{text}e{power}".replace("-", "−") if power else text.replace("-", "−")
 
 
 def value_and_interval(value: float, half: float | None, digits: int = 4) -> tuple[str, str]:

@@ -17,7 +17,7 @@ from zenohkit import free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.cli import moved
-from drivelink.daemon import reload
+from drivelink.daemon import reload, service
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint
@@ -72,6 +72,21 @@ def test_a_second_daemon_of_the_same_name_is_refused_and_leaves_the_drives_alone
             daemon(vsa(endpoint=joint.zenoh.endpoint))
         assert not [f for f in listener.frames() if 0x600 <= f[0] < 0x680 or f[0] == 0]
         listener.close()
+
+
+def test_connections_that_never_say_anything_do_not_hold_up_its_end(monkeypatch):
+    """A session waits for them, up to ten seconds; systemd kills after five."""
+    waited, over, close = threading.Event(), threading.Event(), service.close_session
+    monkeypatch.setattr(
+        service, "close_session", lambda session: (close(session), waited.set(), over.wait(60))
+    )
+    monkeypatch.setattr(service, "_CLOSING_S", 0.05)
+    joint = vsa(endpoint=free_endpoint())
+    with served(joint):
+        with daemon(joint):
+            pass
+        assert not over.is_set() and waited.wait(60)
+    over.set()
 
 
 def test_joints_of_one_daemon_share_the_bus():

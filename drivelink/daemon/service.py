@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import threading
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack
@@ -47,6 +48,7 @@ _ANSWER_S = 0.05
 _FILE_S = 0.2
 _FINDING_S = 1.0
 _COLLECT_S = 5.0
+_CLOSING_S = 2.0  # for subscribers to be told; a service has five to end
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -226,7 +228,7 @@ class Daemon:
         if session is None:
             first = self._joints[0]
             session = open_session(first.joint.zenoh, first.folder)
-            self._closing.callback(close_session, session)
+            self._closing.callback(_close_in_time, session)
             self._closing.callback(watch_router(session, self._tell_router).undeclare)
         publishers: list[JointPublisher | None] = []
         for served in self._joints:
@@ -363,3 +365,13 @@ def _check_agreement(joints: Sequence[ServedJoint]) -> None:
                     f"[{section}] differs between {first.joint.name} and {served.joint.name}: "
                     "joints of one daemon share it; run one daemon for each"
                 )
+
+
+def _close_in_time(session: zenoh.Session) -> None:
+    """Close a session, and leave it to the end of the process where that takes long.
+
+    It waits up to ten seconds for connections that never say anything.
+    """
+    closing = threading.Thread(target=close_session, args=(session,), name="close", daemon=True)
+    closing.start()
+    closing.join(_CLOSING_S)

@@ -64,17 +64,50 @@ def test_a_spring_of_another_stiffness_on_either_side_is_named_and_right():
     assert np.median(np.abs(out[:, 3] / truth.sigma[-6000:, 0, 0] - 1.0)) < 0.005
 
 
-@pytest.mark.parametrize(("periods", "names"), [(0.5, []), (3.0, ["torque_delay"])])
-def test_a_torque_that_is_read_late_is_no_other_effect(periods, names):
-    plants = joints.Plants(*joints.polynomial(np.array([150.0, 8000.0])), 0.12, 0.8, 0.45, 0.3, 3.0)
+def read(*stiffness):
+    """A polynomial spring that a motor bends for twelve seconds: the truth, what is read, what is declared."""
+    plants = joints.Plants(*joints.polynomial(np.array(stiffness)), 0.12, 0.8, 0.45, 0.3, 3.0)
     truth = joints.simulate(plants, joints.sweep(np.random.default_rng(4), 12000, 1, 1, T, 8.0, 3.0), T)
     noise = np.random.default_rng(5).normal(0.0, 0.02, (12000, 1))
-    read = joints.record(truth, 0, T, motor_counts=8192, link_bits=17, torque_noise=noise)
-    moments = np.arange(len(read.sequence))
-    torque = np.interp(moments - periods, moments, read.motor_torque_nm[:, 0])[:, None]
-    joint = joints.joint_model(0.12, 0.8, model="polynomial", order=2, parameters={})
-    estimates, estimator = kit.play(joint, replace(read, motor_torque_nm=torque).samples())
+    record = joints.record(truth, 0, T, motor_counts=8192, link_bits=17, torque_noise=noise)
+    order = len(stiffness)
+    return truth, record, joints.joint_model(0.12, 0.8, model="polynomial", order=order, parameters={})
+
+
+@pytest.mark.parametrize(("periods", "names"), [(0.5, []), (3.0, ["torque_delay"])])
+def test_a_torque_that_is_read_late_is_no_other_effect(periods, names):
+    truth, record, joint = read(150.0, 8000.0)
+    moments = np.arange(len(record.sequence))
+    torque = np.interp(moments - periods, moments, record.motor_torque_nm[:, 0])[:, None]
+    estimates, estimator = kit.play(joint, replace(record, motor_torque_nm=torque).samples())
     off = np.abs(estimates.stiffness_nm_rad / truth.sigma[:, 0, 0] - 1.0)[-4000:]
     assert estimator.undeclared()[0] == names
     assert np.mean(estimates.valid[-4000:]) > 0.99
     assert np.max(off) < 0.01
+
+
+@pytest.mark.parametrize(("off_rad", "names"), [(0.003, []), (0.01, ["deflection_offset"])])
+def test_a_zero_that_is_elsewhere_from_the_start_is_found_where_the_spring_shows_it(off_rad, names):
+    truth, record, joint = read(150.0, 8000.0)
+    moved = replace(record, link_position_rad=record.link_position_rad + off_rad)
+    estimates, estimator = kit.play(joint, moved.samples())
+    off = np.abs(estimates.torque_nm - truth.tau_e[:, 0, 0])
+    rms = np.sqrt(np.mean(truth.tau_e[:, 0, 0] ** 2))
+    assert estimator.undeclared()[0] == names
+    assert np.mean(estimates.valid[-4000:]) > 0.99
+    assert np.max(off[-4000:]) < 0.02 * rms
+    assert np.mean(off[estimates.torque_valid] < kit.WRONG_TORQUE * rms) > 0.99
+
+
+def test_the_torque_of_a_straight_line_is_not_valid_where_its_zero_or_the_torques_may_be_elsewhere():
+    truth, record, joint = read(150.0)
+    rms = np.sqrt(np.mean(truth.tau_e[:, 0, 0] ** 2))
+    for share, valid in ((0.0, 1.0), (0.5, 0.0), (2.0, 0.0)):  # of the torque, that the zero makes
+        moved = replace(record, link_position_rad=record.link_position_rad + share * rms / 150.0)
+        estimates, estimator = kit.play(joint, moved.samples())
+        assert np.mean(estimates.torque_valid[-8000:]) == pytest.approx(valid, abs=0.01)
+        assert (
+            estimator.why() is None
+            if valid
+            else "the zero between the encoders, or the torque's" in estimator.why()[1]
+        )

@@ -4,10 +4,10 @@ use super::Blocks;
 use super::solve::{ALONE, is_causal};
 use crate::choices::{ALIKE, EVEN, EXACT, FEWEST, UNLIKE};
 use crate::gram::{
-    Frame, Gram, Matrix, Posterior, Prior, UNKNOWNS, by_prior, cluster, log_evidence, solve, unknowns,
+    Frame, Gram, Matrix, Posterior, Prior, UNKNOWNS, by_prior, cluster, log_evidence, set, solve, unknowns,
 };
 use crate::student::t_95;
-use crate::unknowns::{INERTIA, LATE, SPRING, ZERO};
+use crate::unknowns::{DRY, INERTIA, LATE, OFFSET, SPRING, ZERO};
 
 impl Blocks {
     /// What the groups that were not chosen, or a zero elsewhere, may change: the covariance between models, by their
@@ -27,11 +27,16 @@ impl Blocks {
         let (_, groups) = self.groups(frame);
         let many = groups.iter().filter(|group| **group != 0).count() as f64;
         let elsewhere = self.prior(total, frame, self.deflection);
+        let offset = (elsewhere.precision[OFFSET][OFFSET] * reduced[ZERO][ZERO] / total.rows).sqrt().recip();
+        let as_offset = self.prior(total, frame, offset);
         let left_out = groups[..ALONE].iter().filter(|group| *group & !chosen.set & frame.set != 0);
-        let rivals = left_out.map(|group| (chosen.set | group, prior)).chain([(chosen.set, &elsewhere)]);
+        // A constant torque is an offset or a zero elsewhere, as likely.
+        let zeros = [(chosen.set, &elsewhere), (chosen.set & !set(OFFSET..DRY), &as_offset)];
+        let rivals = left_out.map(|group| (chosen.set | group, prior)).chain(zeros);
         for (set, prior) in rivals {
+            let (more, less) = (set & !chosen.set, chosen.set & !set);
             // An effect is as rare as there are many; that a series goes on where it is cut off is as likely as not.
-            let usual = if set & !chosen.set & self.spring.shape() == 0 { many.recip() } else { 1.0 };
+            let usual = if less == 0 && more & self.spring.shape() == 0 { many.recip() } else { 1.0 };
             let odds = usual * (log_evidence(reduced, set, prior, noise) - chosen.log_evidence).exp();
             let probability = odds / (1.0 + odds);
             if probability < EVEN {
@@ -41,7 +46,9 @@ impl Blocks {
             for i in unknowns(chosen.set) {
                 for j in unknowns(chosen.set) {
                     let moved = (other.x[i] - chosen.x[i]) * (other.x[j] - chosen.x[j]);
-                    between[i][j] += probability * (moved + other.covariance[i][j] - chosen.covariance[i][j]);
+                    let wider =
+                        if less == 0 { other.covariance[i][j] - chosen.covariance[i][j] } else { 0.0 };
+                    between[i][j] += probability * (moved + wider);
                 }
             }
         }

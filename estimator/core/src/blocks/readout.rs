@@ -4,7 +4,7 @@ use super::Blocks;
 use crate::balance::Balance;
 use crate::choices::{BLOCKS, UNUSUAL, USEFUL};
 use crate::gram::{UNKNOWNS, set};
-use crate::unknowns::{CANDIDATES, LATE, OFFSET, RATE, Reading, SOFT, TORQUE_LATE};
+use crate::unknowns::{CANDIDATES, LATE, OFFSET, RATE, Reading, SOFT, TORQUE_LATE, ZERO};
 
 impl Blocks {
     /// Delay of the link position, s, and its standard deviation.
@@ -56,6 +56,12 @@ impl Blocks {
     #[must_use]
     pub fn torque_rms(&self) -> f64 {
         self.torque
+    }
+
+    /// Standard deviation of the deflection's zero, rad.
+    #[must_use]
+    pub fn zero_std(&self) -> f64 {
+        self.posterior.as_ref().map_or(0.0, |known| known.covariance[ZERO][ZERO].sqrt())
     }
 
     /// rms of what is left of the balance, over that of the measured torque without its mean; NaN before any.

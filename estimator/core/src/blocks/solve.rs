@@ -10,7 +10,7 @@ use crate::gram::{
 use crate::laws::{Law, PARAMETERS};
 use crate::spring::Projection;
 use crate::unknowns::{
-    ACTIVE, CANDIDATES, CLIPS, DRY, RATE, SOFT, SPRING, STOPS, Scale, Spring, TORQUE_LATE, ZERO,
+    ACTIVE, CANDIDATES, CLIPS, DRY, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, TORQUE_LATE, ZERO,
 };
 
 const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
@@ -286,13 +286,22 @@ impl Blocks {
         }
         let found = self.chosen(reduced, base, &groups, prior, noise)?;
         if many && !self.lost && frame.set >> ZERO & 1 == 1 {
-            // The zero is where it is declared, or anywhere in the range.
+            // The zero is where it is declared, or anywhere in the range: then it makes the constant torque.
             let elsewhere = self.prior(total, frame, self.deflection);
             groups[ALONE - 1..].fill(0); // a corner is at the declared zero
-            let other = self.chosen(reduced, base, &groups, &elsewhere, noise)?;
-            let odds = other.log_evidence - found.log_evidence;
-            if odds > (groups.len() as f64).ln() && self.is_seen(&other) {
-                return Some((other, true));
+            let constant = set(OFFSET..DRY);
+            let instead = self.chosen(reduced, base & !constant, &groups, &elsewhere, noise)?;
+            let effects = |found: &Posterior| {
+                CANDIDATES.iter().filter(|one| set(one.unknowns.clone()) & found.set != 0).count() as f64
+            };
+            let more = 1.0 + effects(&instead) - effects(&found);
+            let bare = log_evidence(reduced, found.set & !constant, prior, noise);
+            let odds = instead.log_evidence - found.log_evidence.max(bare);
+            if odds > more * (groups.len() as f64).ln() {
+                let other = solve(reduced, instead.set | constant, &elsewhere, noise)?;
+                if self.is_seen(&other) {
+                    return Some((other, true));
+                }
             }
         }
         Some((found, false))

@@ -62,11 +62,15 @@ impl Side {
         if self.rigid {
             return [None; 2];
         }
-        let lost = |reason: Reason| if self.blocks.is_lost() { Reason::Lost } else { reason };
+        let lost = self.blocks.is_lost();
+        let least = valid_within * self.blocks.torque_rms();
+        let imprecise = part.flexibility_torque_std >= least || part.flexibility_torque_std.is_nan();
+        let elsewhere = lost || part.stiffness * self.blocks.zero_std() >= least;
         let share = part.flexibility_torque_std / self.blocks.torque_rms();
-        let imprecise = share >= valid_within || part.flexibility_torque_std.is_nan();
-        let torque = imprecise.then_some(Reason::TorqueImprecise(share)).map(lost);
-        let stiffness = Reason::of_precision(part.stiffness, part.stiffness_std, valid_within).map(lost);
+        let why = if elsewhere { Reason::Lost } else { Reason::TorqueImprecise(share) };
+        let torque = imprecise.then_some(why);
+        let stiffness = Reason::of_precision(part.stiffness, part.stiffness_std, valid_within)
+            .map(|reason| if lost { Reason::Lost } else { reason });
         [stiffness.or(torque), torque]
     }
 

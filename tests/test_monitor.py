@@ -231,7 +231,7 @@ def test_an_error_of_the_valid_cycles_does_not_stand_beside_an_estimate_that_is_
     view = filled(truth=True)
     last = estimate(5000, status=0)
     view.update(last, 5.0, Truth(last[2], last[3]))
-    assert "truth" in "\n".join(lines(view)) and " error " not in "\n".join(lines(view))
+    assert "truth" in "\n".join(lines(view)) and " error " not in "\n".join(lines(view)) + view.line()
 
 
 def test_sparkline_and_plot_take_anything_and_are_never_wider_than_their_room():

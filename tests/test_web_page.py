@@ -156,6 +156,15 @@ def test_what_is_not_valid_is_shown_grey_with_the_reason_and_sets_no_scale():
     assert (title, style) == ("not valid · elbow · drivelink", "past")
 
 
+def test_an_external_torque_that_is_not_valid_has_no_unit():
+    view = fed()
+    view.update_external(ExternalMessage(4000, 4_000_000_000, 0, math.nan, math.nan), 4.0)
+    assert page("take(sent[0]); return [shown('external'), $('externalunit').hidden];", view) == [
+        "not valid",
+        True,
+    ]
+
+
 def test_a_torque_or_deflection_that_passes_zero_does_not_change_its_notation():
     view, one = fed(), (TransmissionEstimate(2.1e-4, 100.0, 1.0, -3e-6),)
     view.update(Estimate(4100, 3, 2.1e-4, 100.0, 1.0, one), 4.1)

@@ -139,7 +139,7 @@ class JointView:
             f"deflection {self.deflections(' ')}",
             "rad, " + ", ".join(text for text, _ in self.flags),
         ]
-        if math.isfinite(self.errors[0]):
+        if math.isfinite(self.errors[0]) and estimate.status & Status.VALID:
             parts[-1] += f", stiffness rms error {100 * self.errors[0]:.2f} %"
         if self.status:
             parts[-1] += f", {status_text(self.status, self.model, self.finding)}"

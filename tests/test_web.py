@@ -85,6 +85,10 @@ def test_the_page_draws_live_plots_in_a_browser(web, polling, tmp_path):
         for width in (390, 800, 1200):  # no number reaches into the next one
             browser.resize(width, 900)
             assert browser.evaluate(WIDE) == 0
+            assert (
+                browser.evaluate("new Set(['measured', 'save', 'pause'].map(id => $(id).offsetTop)).size")
+                == 1
+            )
         browser.wait_for(BLUE)  # the curve
         browser.screenshot(tmp_path / "page.png")
         assert (tmp_path / "page.png").stat().st_size > 20_000

@@ -43,7 +43,7 @@ PROTECTIONS = [
         ("size of an MCAP chunk", "recording/mcapfile.py", "    if size > MAX_BLOCK_BYTES:", "    if False:", f"{LIMITS} -k mcap_chunk"),
         ("size of an MCAP message", "recording/mcapfile.py", "if len(data) > _MESSAGE_BYTES:", "if False:", f"{LIMITS} -k messages_of_others"),
         ("number of records", "recording/mcapfile.py", "if count > most:", "if False:", f"{LIMITS} -k 'without_end or so_many'"),
-        ("number of frames", "recording/canlog.py", "if most < 0:", "if False:", f"{LIMITS} -k blf"),
+        ("number of frames", "recording/canlog.py", "raise too_many_records(path)", "pass", f"{LIMITS} -k blf"),
         ("flat messages", "recording/mcapfile.py", 'if b"[" in data or', "if False and", f"{LIMITS} -k messages_of_others"),
         ("objects of an EDS file", "canopen/eds.py", "if len(found) > _MOST_OBJECTS:", "if False:", "tests/test_canopen_eds.py -k bounded"),
         ("digits of an EDS file", "canopen/eds.py", "or len(text) > _MOST_DIGITS:", "or False:", "tests/test_canopen_eds.py -k bounded"),

@@ -392,6 +392,20 @@ def test_a_blf_container_that_begins_at_the_limit_unpacks_to_nothing(tmp_path):
         list(read_frames(path))
 
 
+def test_a_file_with_too_many_frames_is_refused_where_it_has_them(tmp_path):
+    """Not after as many as its whole size allows."""
+    path, passed = tmp_path / "r.blf", 0
+    path.write_bytes(BLF_HEAD + blf_container(zlib.compress(blf_frame() * 100, 9), 0) * 5000)
+    with one_line("one record for each"):
+        for passed, _ in enumerate(read_frames(path), 1):  # noqa: B007
+            pass
+    assert passed < 20_000
+    path = mcap_of(tmp_path / "r.mcap", [("can", 0, b'{"id":385,"data":""}')] * 20_000)
+    path.write_bytes(path.read_bytes() + bytes(1 << 20))
+    with one_line("one record for each"):
+        read(path, JOINT)
+
+
 @pytest.mark.parametrize(
     ("can_id", "read_of_it", "said"),
     [

@@ -6,7 +6,6 @@ Yields data frames with 11-bit identifiers as tuples, in file order.
 from __future__ import annotations
 
 import logging
-import os
 import re
 from binascii import unhexlify
 from collections.abc import Callable, Iterable, Iterator
@@ -283,14 +282,14 @@ def _asc_frames(file: IO[bytes], path: Path) -> Iterator[Frame | None]:
 
 def _foreign_frames(path: Path, reader: _Reader) -> Iterator[LoggedFrame]:
     """Those of another tool's format; a truncated file ends at its last complete frame."""
-    count = foreign = 0
+    count = foreign = most = 0
     try:
         with open_regular(path) as file:
-            most = most_records(os.fstat(file.fileno()).st_size)
             for frame in reader(file, path):
-                most -= 1
-                if most < 0:
-                    raise too_many_records(path)
+                if count + foreign >= most:
+                    most = most_records(file.tell())
+                    if count + foreign >= most:
+                        raise too_many_records(path)
                 if frame is None or frame[1] > _LAST_ID or len(frame[2]) > _LONGEST:
                     foreign += 1
                     if not count and foreign > _FOREIGN:

@@ -39,7 +39,7 @@ def require_samples(count: int, where: str) -> None:
 
 
 def most_records(size: int) -> int:
-    """Return how many records, frames for instance, a file of so many bytes may have, packed as it may be."""
+    """Return how many records, frames for instance, so many bytes of a file may have, packed as can be."""
     return _FEW_RECORDS + int(size / _RECORD_BYTES)
 
 

@@ -77,7 +77,7 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
     channels: dict[int, str | None] = {}
     with _opened(path) as file:
         size = os.fstat(file.fileno()).st_size
-        unpacked, most = 0, most_records(size)
+        unpacked = count = 0
         try:
             for opcode, record in _records(file, path, _WANTED):
                 records = _decompressed(record[_HEAD.size :], path) if opcode == _CHUNK_OP else record
@@ -86,7 +86,8 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
                     raise RecordingError(
                         f"{path}: expected to unpack to at most {_MOST_RATIO} times its size"
                     )
-                most -= yield from _messages(records, channels, topics, most, path)
+                most = most_records(file.tell()) - count
+                count += yield from _messages(records, channels, topics, most, path)
         except _BrokenError:
             _warn_once(path, path.stat().st_mtime_ns)
 

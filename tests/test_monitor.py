@@ -93,6 +93,7 @@ def test_a_view_without_anything_yet_says_so():
     view = filled()
     view.status = {"state": "running"}  # no baseline: not a word of what is observable beside a green one
     text = "\n".join(lines(view, 120, 40))
+    assert view.line().endswith("observable")  # and no comma after it, as in a replay
     assert "no baseline: drivelink fit" in text and "● observable" in text and "not observable" not in text
 
 

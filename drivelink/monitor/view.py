@@ -141,8 +141,8 @@ class JointView:
         ]
         if math.isfinite(self.errors[0]) and estimate.status & Status.VALID:
             parts[-1] += f", stiffness rms error {100 * self.errors[0]:.2f} %"
-        if self.status:
-            parts[-1] += f", {status_text(self.status, self.model, self.finding)}"
+        if said := status_text(self.status, self.model, self.finding):
+            parts[-1] += f", {said}"
         return " ".join(parts)
 
     def _torque(self, value_nm: float) -> str:

@@ -168,7 +168,7 @@ def test_an_external_torque_that_is_not_valid_has_no_unit():
 def test_a_torque_or_deflection_that_passes_zero_does_not_change_its_notation():
     view, one = fed(), (TransmissionEstimate(2.1e-4, 100.0, 1.0, -3e-6),)
     view.update(Estimate(4100, 3, 2.1e-4, 100.0, 1.0, one), 4.1)
-    assert page("take(sent[0]); return [shown('torque'), shown('deflection')];", view) == ["0.000", "0.00000"]
+    assert page("take(sent[0]); return [shown('torque'), shown('deflection')];", view) == ["0.000", "0.0000"]
 
 
 def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers():

@@ -151,7 +151,7 @@ class JointView:
     def deflections(self, between: str) -> str:
         """Return the deflection of each transmission now."""
         ones = self.history.latest.transmissions if self.history.latest else ()
-        return between.join(among(one.deflection_rad, self.history.largest_deflection_rad) for one in ones)
+        return between.join(among(one.deflection_rad, self.history.largest_deflection_rad, 3) for one in ones)
 
     def _external_words(self) -> list[str]:
         touch = self.history.touch

@@ -184,9 +184,10 @@ def test_a_sample_that_the_next_sync_completes_has_the_stamp_of_its_own():
 
 
 def test_only_lines_of_an_asc_file_that_say_something_are_looked_at(tmp_path):
-    foreign = b"\n" * 1000 + b" \r\n// x\nx\n1\n0.1 1\n"
-    text = AscText(BytesIO(foreign + b"date x\n" + foreign), tmp_path / "r.asc")
-    assert [text.readline(), text.readline()] == ["date x\n", ""]
+    foreign, head = b"\n" * 1000 + b" \r\n// x\nx\n1\n0.1 \n", b"base hex timestamps relative\n"
+    text = AscText(BytesIO(foreign + head + foreign + b"0.1 event\n0.2 1 80 Rx d 0\n"), tmp_path / "r.asc")
+    found = [text.readline() for _ in range(4)]
+    assert found == [head.decode(), "0.100000000 event\n", "0.300000000 1 80 Rx d 0\n", ""]
 
 
 def test_a_text_with_more_foreign_lines_than_frames_is_no_log(tmp_path):

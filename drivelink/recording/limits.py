@@ -70,7 +70,7 @@ _EMPTY_FD = re.compile(
 _REMOTE = 0x10  # among these flags
 _NEWLINE = ord("\n")
 # what python-can looks at in an ASC file; a megabyte of other lines costs it more than a second
-_OF_ASC = re.compile(rb"\s*(?:\d+\.\d+\s+\S+\s+\S|(?:date|base|begin|internal|no)\s)", re.IGNORECASE)
+_OF_ASC = re.compile(rb"\s*(?:\d+\.\d+\s+\S|(?:date|base|begin|internal|no)\s)", re.IGNORECASE)
 
 
 def whole_lines(file: IO[bytes], path: Path, number: int = 1) -> Iterator[bytes]:

@@ -338,7 +338,7 @@ def _diagnoses(joint: dict[str, Any]) -> str:
 
 def _broken(broken: Sequence[dict[str, Any]]) -> list[Section]:
     rows: Rows = [(row["recording"], row["error"]) for row in broken[:_BROKEN]]
-    blocks: list[Block] = [Grid(("recording", ""), rows)]
+    blocks: list[Block] = [Grid(("recording", "why it could not be used"), rows)]
     if len(broken) > _BROKEN:
         blocks.append(Paragraph(f"and {len(broken) - _BROKEN} more, in fleet.json."))
     return [Section("Recordings that could not be used", blocks)] if rows else []

@@ -151,11 +151,15 @@ static double transmitted(const double *x, double *slope) {
     return torque + (hysteresis ? hysteresis_torque * x[5] : 0) + transmission_damping * (x[3] - x[1]);
 }
 
+/* Dry friction of the motor, sliding: its level. */
+static double sliding(const double *x, double torque) {
+    double peak = friction >= STRIBECK ? stribeck * coulomb * exp(-pow(x[1] / stribeck_velocity, 2)) : 0;
+    return (friction ? coulomb : 0) + gear_loss * fabs(torque) + peak;
+}
+
 static void rate(const double *x, double motor, double external, double *dx) {
     double slope, torque = transmitted(x, &slope), w = x[1], phi_rate = x[3] - x[1], z = x[5];
-    double sliding = (friction ? coulomb : 0) + gear_loss * fabs(torque);
-    double peak = friction >= STRIBECK ? stribeck * coulomb * exp(-pow(w / stribeck_velocity, 2)) : 0;
-    double level = sliding + peak, resisting = level * tanh(w / 2e-3);
+    double level = sliding(x, torque), resisting = 0;
     dx[4] = 0;
     if (friction == LUGRE && level > 0) { /* the stiffness of the bristles is that of the sliding friction */
         double bristles = coulomb / bristle;
@@ -171,6 +175,14 @@ static void rate(const double *x, double motor, double external, double *dx) {
     dx[5] = hysteresis ? phi_rate / hysteresis_width * (1 - turned) : 0;
 }
 
+/* Friction without bristles takes the motor's momentum, all of it at most: then it sticks, and does not creep. */
+static void rub(double *x, double h) {
+    double slope, most = sliding(x, transmitted(x, &slope)) * h / inertia;
+    double taken = friction == LUGRE ? 0 : fmin(fmax(x[1], -most), most);
+    x[0] -= taken * h / 2;
+    x[1] -= taken;
+}
+
 static void advance(double *x, double motor, double external, double h) {
     double k[4][STATES], y[STATES];
     for (int stage = 0; stage < 4; stage++) {
@@ -179,6 +191,7 @@ static void advance(double *x, double motor, double external, double h) {
         rate(y, motor, external, k[stage]);
     }
     for (int i = 0; i < STATES; i++) x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+    rub(x, h);
 }
 
 /* Sum of sines from `low` to `high` Hz with random phases, of rms amplitude/√2. */

@@ -77,6 +77,7 @@ def test_the_joint_without_effects_is_that_of_another_integrator(spring, law):
     ("effect", "law", "where"),
     [
         ("gear_loss=0.1", lambda c, w: -0.1 * np.abs(c["true_flexibility_torque_nm"]) * np.sign(w), 0.05),
+        ("friction=coulomb coulomb=0.3", lambda c, w: -0.3 * np.sign(w), 0.05),
         ("friction=lugre coulomb=0.3", lambda c, w: -0.3 * np.sign(w), 0.4),
         ("cogging=0.2", lambda c, w: -0.2 * np.sin(32 * c["motor1_position_rad"]), 0.0),
     ],
@@ -90,6 +91,12 @@ def test_each_effect_leaves_in_the_balance_of_the_motor_what_it_is(effect, law, 
     left = 0.12 * np.diff(theta, 2) / 1e-6 + 0.8 * speed[1:-1] - c["true_flexibility_torque_nm"][1:-1] - held
     off = np.abs(left - law(c, speed)[1:-1])[100:]
     assert np.quantile(off[np.abs(speed[101:-1]) > where], 0.5 if "lugre" in effect else 1.0) < 0.01
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "stribeck"])
+def test_a_motor_that_friction_holds_does_not_creep(friction):
+    c = simulated(f"friction={friction} coulomb=0.5 motion=harmonic size=0.4 gravity=0 {EXACT}").columns
+    assert np.max(np.abs(c["motor1_position_rad"])) < 1e-6
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from estimator import (
     make_estimator,
 )
 from estimator.diagnosis import diagnose
+from estimator.diagnosis.fourier import Shape
 from estimator.freerun import free_run
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -97,6 +98,20 @@ def test_each_effect_leaves_in_the_balance_of_the_motor_what_it_is(effect, law, 
 def test_a_motor_that_friction_holds_does_not_creep(friction):
     c = simulated(f"friction={friction} coulomb=0.5 motion=harmonic size=0.4 gravity=0 {EXACT}").columns
     assert np.max(np.abs(c["motor1_position_rad"])) < 1e-6
+
+
+@pytest.mark.parametrize(("number", "share"), [(937, 0.5), (911, 1.0)], ids=["coulomb", "stribeck"])
+def test_friction_is_named_where_slow_reversals_let_the_motor_stand(number, share):
+    """A motor at rest has any friction up to its level: a law of the velocity alone leaves as much there."""
+    case = list(motion.CASES.values())[number % len(motion.CASES)]
+    joint = motion.joint_of(case, number)
+    numbers = np.random.default_rng(1000 + number).uniform(-1.0, 1.0, (1, Shape.size(1)))
+    numbers[0, 0] = 1.0  # begins a hundred times slower than it ends
+    path = Shape(numbers, 12.0, joint.limits).path(1e-3).scaled(share)
+    record = joint.moved(12.0, number, path).record
+    found = diagnose(record, joint.model)
+    assert motion.decided(found, case.names), found.effects
+    assert found.validation.after_relative < 0.02
 
 
 @pytest.mark.slow

@@ -141,7 +141,7 @@ def columns(
         weights: its linear ones, as far as they are known: the reaction depends on them too.
     """
     kind = candidate.kind
-    lasting = kind.location == "motor" and _OF_MOTOR.issuperset(kind.coordinates)
+    lasting = kind.location == "motor" and not _slips(kind) and _OF_MOTOR.issuperset(kind.coordinates)
     memo = frame.signals.memo if lasting else frame.memo
     key = (candidate.key, *values.values(), *(weights if _bilinear(kind) else ()))
     made = memo.get(key)
@@ -157,10 +157,30 @@ def _bilinear(kind: EffectType) -> bool:
     return kind.name == "kinematic_error"
 
 
+def _slips(kind: EffectType) -> bool:
+    """Whether an effect is dry friction of a motor, a law of the direction it moves in."""
+    return kind.location == "motor" and "smoothing_rad_s" in kind.nonlinear
+
+
+def _rubbing(frame: Frame, motor: int) -> Coordinates:
+    """A motor's coordinates as dry friction has them.
+
+    Dry friction holds a motor at rest with what all else leaves of the balance, up to its level (a set-valued
+    law: Acary and Brogliato, Numerical Methods for Nonsmooth Dynamical Systems, 2008). No reading tells this
+    from a velocity; so a velocity is moved within its noise to where friction is what the balance leaves.
+    """
+    here, key = frame.motors[motor], ("rubbing", motor)
+    if key not in frame.memo:
+        held = here.flexibility_torque - frame.motor_balance(motor)
+        noise = choice("sure") * frame.signals.velocity_noise(motor)
+        frame.memo[key] = here.velocity + noise * held / max(_rms(held), 1e-300)
+    return here._replace(velocity=frame.memo[key])
+
+
 def _columns(frame: Frame, candidate: Candidate, values: Values, weights: tuple[float, ...]) -> FloatArray:
     """The columns (k, rows) of an effect."""
     kind, motor = candidate.kind, candidate.motor or 0
-    terms = kind.terms(frame.motors[motor], values)
+    terms = kind.terms(_rubbing(frame, motor) if _slips(kind) else frame.motors[motor], values)
     if kind.channel == "link_position":
         return _reading(frame, terms)
     if kind.channel == "deflection" and candidate.motor is None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from estimator.choices import whole
+from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import members
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.problem import Problem, stretches
@@ -147,15 +147,17 @@ class Held:
         return min(fall, _in_errors(self.scores(found, both) - self.scores(rest, both)))
 
     def _preferred(self, found: Fitted, models: Sequence[Fitted]) -> list[bool]:
-        """Whether each says more of the phenomena of the one found and held-out data ask for it, for more
-        than it costs, be it for less than laws leave anyway; none that they tell from the best of these.
+        """Whether each says more of the phenomena of the one found and held-out data surely ask for it, for
+        more than it costs, be it for less than laws leave anyway; none that they tell from the best of these.
+
+        Not surely: a single one of ten blocks has its gain as mean and as standard error.
         """
         errors = self._independent(found)
 
         def beats(one: Fitted, other: Fitted) -> bool:
             gain = self.scores(one) - self.scores(other)
             cost = other.log_prior(errors, self.price) - one.log_prior(errors, self.price)
-            return _in_errors(gain) > 1.0 and errors * float(np.mean(gain)) > cost
+            return _in_errors(gain) > choice("sure") and errors * float(np.mean(gain)) > cost
 
         richer = [one for one in models if _refines(one, found) and beats(one, found)]
         best = max(richer, key=lambda one: float(np.mean(self.scores(one))), default=found)

@@ -170,9 +170,11 @@ class _Rivals:
 
     def least(self, i: int, run: Record) -> float:
         """Return how many times more than `diagnose` asks for the i-th rival, which made a recording, gains
-        over the best of the others.
+        over the best of the others; none where it is a ripple that this motion is too short for.
         """
         held, fitted = self._judged(run, 0)
+        if not all(_shown(held.problem, term) for term in fitted[i].terms):
+            return 0.0
         return max(min(held.margin(fitted[i], one) for j, one in enumerate(fitted) if j != i), 0.0)
 
     def _judged(self, run: Record, steps: int | None) -> tuple[Held, list[Fitted]]:
@@ -231,6 +233,14 @@ def _noise(
 def _over(run: Record, limits: Limits) -> float:
     """Largest torque over its limit, of all motors."""
     return float(np.max(np.abs(run.motor_torque_nm) / limits.torque_nm))
+
+
+def _shown(problem: Problem, term: Term) -> bool:
+    """Whether a motion is long enough for a ripple to be one."""
+    if "periods_per_rev" not in term.values:
+        return True
+    slowest = grid(problem.frames[0], term.candidate, problem.smoothing_rad_s, 1)
+    return any(values["periods_per_rev"] <= term.values["periods_per_rev"] for values in slowest)
 
 
 def _words(fitted: Fitted) -> str:

@@ -1,5 +1,6 @@
 """What nobody declared: a held motor's friction, springs that bend, a shape that the motion does not show."""
 
+import itertools
 from dataclasses import replace
 
 import heldmotor
@@ -111,3 +112,27 @@ def test_the_torque_of_a_straight_line_is_not_valid_where_its_zero_or_the_torque
             if valid
             else "the zero between the encoders, or the torque's" in estimator.why()[1]
         )
+
+
+def test_friction_at_rest_is_no_hysteresis():
+    """Moves of a second between places, and a second's rest at each: there friction holds whatever the spring leaves."""
+    plants = joints.Plants(
+        *joints.polynomial(np.array([150.0, 8000.0])), 0.12, 0.8, 0.45, 0.3, 3.0, coulomb=np.array([0.15])
+    )
+    places = np.random.default_rng(6).uniform(-1.0, 1.0, 11)
+    share = np.clip(np.arange(0.0, 2.0, T), 0.0, 1.0)
+    way = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    path = np.concatenate([a + (b - a) * way for a, b in itertools.pairwise(places)])
+
+    def torque(k, state):
+        return 60.0 * (path[k] - path[0] - state[:, :1]) - 4.0 * state[:, 1:2]
+
+    truth = joints.simulate(plants, torque, T, size=(len(path), 1, 1))
+    noise = np.random.default_rng(5).normal(0.0, 0.02, (len(path), 1))
+    record = joints.record(truth, 0, T, motor_counts=8192, link_bits=17, torque_noise=noise)
+    joint = joints.joint_model(0.12, 0.8, model="polynomial", order=2, parameters={})
+    estimates, estimator = kit.play(joint, record.samples())
+    off = np.abs(estimates.stiffness_nm_rad / truth.sigma[:, 0, 0] - 1.0)
+    assert estimator.undeclared()[0] == []
+    assert np.mean(estimates.valid[-8000:]) > 0.95
+    assert np.max(off[-8000:]) < 0.03

@@ -15,7 +15,7 @@ use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection, TERMS};
 use crate::student::f_quantile;
-use crate::unknowns::{ACTIVE, Spring};
+use crate::unknowns::{ACTIVE, DRY, Spring};
 
 /// What a block did.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -257,6 +257,8 @@ impl Blocks {
 
     /// One row; what happened where it fills a block.
     pub fn add(&mut self, row: &Row) -> Option<Closed> {
+        let weight = self.weight(row);
+        let row = &row.map(|value| weight.sqrt() * value);
         if self.is_reference() {
             let left = dot(row, &self.residual);
             self.quick += (self.period / LOOK_S).min(1.0) * (left * left - self.quick);
@@ -270,11 +272,20 @@ impl Blocks {
             return None;
         }
         self.open.add_row(row);
+        self.open.rows += weight - 1.0;
         if self.open.rows < self.rows {
             return None;
         }
         let block = std::mem::take(&mut self.open);
         Some(self.close(block))
+    }
+
+    /// What a row tells beside others: dry friction at rest is anything up to what it is in motion.
+    fn weight(&self, row: &Row) -> f64 {
+        let Some(known) = self.posterior.as_ref().filter(|_| self.is_reference()) else { return 1.0 };
+        let rest = (1.0 - row[balance::DRY].powi(2)).max(0.0);
+        let open = rest * known.x[DRY].powi(2);
+        self.noise.variance / (self.noise.variance + open)
     }
 
     /// Whether the latest rows are neither noise, nor as large as what explained blocks have held, nor uncertain.

@@ -4,6 +4,7 @@ import json
 import socket
 import urllib.error
 import urllib.request
+from contextlib import suppress
 
 import chromium
 import pytest
@@ -128,6 +129,21 @@ def test_the_page_serves_so_many_connections_at_a_time_and_leaves_those_that_say
     monkeypatch.setattr("drivelink.monitor.web._Handler.timeout", 0.1)
     with connect(web) as silent:
         assert silent.recv(100) == b""
+
+
+def test_who_says_a_byte_now_and_then_gives_way_too(web, monkeypatch):
+    monkeypatch.setattr("drivelink.monitor.webserver.PATIENCE_S", 0.3)
+    slow = [connect(web) for _ in range(MAX_CONNECTIONS)]
+
+    def drip():
+        for connection in slow:
+            with suppress(OSError):
+                connection.sendall(b"x")
+
+    with zenohkit.repeated(drip, 0.05):
+        zenohkit.until(lambda: get(web.url)[0] == 200, 20.0)
+    for connection in slow:
+        connection.close()
 
 
 def stream(web, **headers):

@@ -30,7 +30,7 @@ from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.webaccept import ACTIONS, WebAcceptance
 from drivelink.monitor.webday import WebDay
-from drivelink.monitor.webserver import Server
+from drivelink.monitor.webserver import PATIENCE_S, Server
 from drivelink.output.numbers import number
 from drivelink.pubsub.feed import decode_document
 from estimator.sample import Sample
@@ -38,7 +38,6 @@ from estimator.sample import Sample
 MAX_STREAMS = 8
 _MOST_BODY = 4096  # bytes of a request of the page
 _DETAILS = 16  # lines of a finding
-_PATIENCE_S = 5.0  # timeout of a silent browser
 _EVENT_S = 0.1
 _LOCAL_HOSTS = frozenset({"localhost", "127.0.0.1", "[::1]"})
 _OWN_PAGES = ("same-origin", "none")  # what a browser says of our page, and of the user's own request
@@ -274,7 +273,7 @@ class _Handler(BaseHTTPRequestHandler):
     """One request: the page, or the stream of events."""
 
     web: WebView
-    timeout = _PATIENCE_S
+    timeout = PATIENCE_S
     protocol_version = "HTTP/1.1"
     server_version = "drivelink"
     sys_version = ""

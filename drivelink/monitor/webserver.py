@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 MAX_CONNECTIONS = 16
+PATIENCE_S = 5.0  # for a whole request, however slowly it comes, and with a silent browser
 
 
 class Server(ThreadingHTTPServer):
@@ -34,10 +36,20 @@ class Server(ThreadingHTTPServer):
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Serve a connection to its end."""
+        late = threading.Timer(PATIENCE_S, _hear_no_more, (request,))
+        late.daemon = True
+        late.start()
         try:
             super().process_request_thread(request, client_address)
         finally:
+            late.cancel()
             self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore connections that end early."""
+
+
+def _hear_no_more(request: Any) -> None:
+    """End what a browser says; an answer goes on."""
+    with suppress(OSError):
+        request.shutdown(socket.SHUT_RD)

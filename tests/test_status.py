@@ -40,6 +40,13 @@ def test_a_condition_is_said_when_it_begins_and_when_it_ends(events, caplog):
     assert caplog.messages == ["it is hot", "it is cool again"]
 
 
+def test_a_condition_that_holds_has_its_present_figures_and_is_said_once(events, caplog):
+    events.begin("slow", "cycles left out so far: 1")
+    events.begin("slow", "cycles left out so far: 206")
+    assert events.active == {"slow": "cycles left out so far: 206"}
+    assert caplog.messages == ["cycles left out so far: 1"]
+
+
 def test_what_comes_and_goes_is_counted_not_repeated(events, clock, caplog):
     for _ in range(500):
         events.begin("flaky", "the cable is loose")

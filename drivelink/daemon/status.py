@@ -56,11 +56,11 @@ class EventLog:
         self._note(self._limited(key or text, source), text, level)
 
     def begin(self, key: str, text: str, level: int = logging.WARNING) -> None:
-        """Report that a condition begins; ignored while it holds."""
-        if key in self._active:
-            return
+        """Report that a condition begins; while it holds, only its text is renewed."""
+        begins = key not in self._active
         self._active[key] = text
-        self._note(f"{key} begins", text, level)
+        if begins:
+            self._note(f"{key} begins", text, level)
 
     def end(self, key: str, text: str = "") -> None:
         """Report that a condition has ended."""

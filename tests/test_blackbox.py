@@ -207,8 +207,9 @@ def test_the_oldest_is_dropped_beyond_the_budget_and_nothing_else(tmp_path):
 
 def test_keep_without_a_black_box_says_what_it_expects(tmp_path, capsys):
     path = joint_file(tmp_path, zenohkit.free_endpoint())
-    assert cli.main(["keep", str(path)]) == 3
-    assert "recording.folder: expected the folder of the black box" in capsys.readouterr().err
+    for verb in ("keep", "accept"):
+        assert cli.main([verb, str(path)]) == 2
+        assert "recording.folder: expected the folder of the black box" in capsys.readouterr().err
     path.write_text(path.read_text() + '[recording]\nfolder = "kept"\n')
     assert cli.main(["keep", str(path)]) == 3
     assert "no black box writes there: expected a daemon that was started since" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from drivelink.errors import DrivelinkError, RecordingError
+from drivelink.errors import DrivelinkError, JointFileError, RecordingError
 from drivelink.files import read_regular, write_whole
 from drivelink.jointfile import JointText
 from drivelink.pubsub.feed import MAX_BYTES, decode_document
@@ -79,11 +79,11 @@ def folder_of(text: JointText) -> Path:
     """Return the folder of a joint's black box.
 
     Raises:
-        RecordingError: the joint file declares none.
+        JointFileError: the joint file declares none.
     """
     folder = text.joint.recording.folder
     if folder is None:
-        raise RecordingError(f"{text.name}: recording.folder: expected the folder of the black box, got none")
+        raise JointFileError(f"{text.name}: recording.folder: expected the folder of the black box, got none")
     return text.folder / folder
 
 
@@ -91,7 +91,7 @@ def wish_of(text: JointText) -> Path:
     """Return the file that asks the black box of a joint to keep the last minute; it renames it to `taken`.
 
     Raises:
-        RecordingError: the joint file declares no folder.
+        JointFileError: the joint file declares no folder.
     """
     return folder_of(text) / f"{text.joint.name}.keep"
 

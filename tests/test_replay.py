@@ -18,9 +18,11 @@ import zenohkit
 from test_read_back import forge
 
 from drivelink import cli, jointfile, subscribe
+from drivelink.cli import warn
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointText, parse
 from drivelink.loop.diagnosing import _read
+from drivelink.output.progress import Meter
 from drivelink.pubsub.publisher import JointPublisher, describe_model, to_json
 from drivelink.pubsub.session import close_session, open_client, open_session
 from drivelink.pubsub.wire import EstimateMessage
@@ -356,6 +358,15 @@ def test_estimates_csv_has_the_columns_of_the_contract_and_a_row_for_each_sample
     assert "1500 cycles" in capsys.readouterr().out
     assert cli.main(["replay", str(recording), *arguments[:2], "--out", "/no/such/folder/e.csv"]) == 3
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_the_name_of_a_recording_does_not_reach_the_terminal_as_a_command(tmp_path, joint_path, capsys):
+    recording = sine.ours(tmp_path / "\x1b[2J\x9br.csv", 1500)
+    assert cli.main(["replay", str(recording), "--joint", str(joint_path)]) == 0
+    warn(recording, ["said"])
+    shown = "".join(capsys.readouterr())
+    assert "[2Jr.csv: 1500 cycles" in shown and "[2Jr.csv: warning: said" in shown
+    assert not set("\x1b\x9b") & set(shown + Meter(f"replay {recording.name}")._title())
 
 
 def test_ctrl_c_leaves_the_estimates_so_far(tmp_path, joint_path):

@@ -249,7 +249,7 @@ def require_distinct(paths: Sequence[Path]) -> None:
 def warn(path: Path, lines: Sequence[str]) -> None:
     """Print what the gate says of a recording, on stderr."""
     for line in lines:
-        print(f"{path}: warning: {line}", file=sys.stderr)
+        print(clean_text(f"{path}: warning: {line}"), file=sys.stderr)
 
 
 def conclude(as_json: bool, content: Mapping[str, Any], sections: Iterable[Section]) -> None:

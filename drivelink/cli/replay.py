@@ -13,6 +13,7 @@ from drivelink.cli import add_map, add_number, recording_path, warn
 from drivelink.files import check_target
 from drivelink.jointfile import JointFile
 from drivelink.output.progress import Meter
+from drivelink.plaintext import clean_text
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 from drivelink.recording import read
@@ -125,13 +126,13 @@ def _report(
         }
         print(json.dumps(document))
         return
-    print(f"{args.file}: {summary.text(took_s)}")
-    for line in summary.reasons():
-        print(f"  not valid in {line}")
-    for path in made:
-        print(f"plot: {path}")
+    lines = [f"{args.file}: {summary.text(took_s)}"]
+    lines += [f"  not valid in {line}" for line in summary.reasons()]
+    lines += [f"plot: {path}" for path in made]
     if args.out is not None:
-        print(f"estimates: {args.out}" + (" (up to the interruption)" if interrupted else ""))
+        lines.append(f"estimates: {args.out}" + (" (up to the interruption)" if interrupted else ""))
+    for line in lines:
+        print(clean_text(line))
 
 
 def _play(playback: Playback, sinks: Sequence[Sink], title: str) -> bool:

@@ -11,6 +11,8 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from drivelink.plaintext import clean_text
+
 _QUIET_S = 1.0  # nothing is shown before
 _LINE_S = 5.0  # between two plain lines
 
@@ -28,7 +30,7 @@ class Meter:
 
     def __init__(self, what: str, total: int | None = None, console: Console | None = None) -> None:
         self.done = 0
-        self._what = what
+        self._what = clean_text(what)
         self._total = total
         self._stage = ""
         self._console = console or Console(stderr=True)

@@ -363,9 +363,12 @@ def test_estimates_csv_has_the_columns_of_the_contract_and_a_row_for_each_sample
 def test_the_name_of_a_recording_does_not_reach_the_terminal_as_a_command(tmp_path, joint_path, capsys):
     recording = sine.ours(tmp_path / "\x1b[2J\x9br.csv", 1500)
     assert cli.main(["replay", str(recording), "--joint", str(joint_path)]) == 0
+    assert cli.main(["fit", str(recording), "--joint", str(joint_path)]) == 0
     warn(recording, ["said"])
     shown = "".join(capsys.readouterr())
-    assert "[2Jr.csv: 1500 cycles" in shown and "[2Jr.csv: warning: said" in shown
+    assert (
+        "[2Jr.csv: 1500 cycles" in shown and "[2Jr.csv: warning: said" in shown and "fit of [2Jr.csv" in shown
+    )
     assert not set("\x1b\x9b") & set(shown + Meter(f"replay {recording.name}")._title())
 
 

@@ -19,7 +19,7 @@ from rich.text import Text
 from drivelink.files import write_whole
 from drivelink.output import plots
 from drivelink.output.numbers import Units
-from drivelink.plaintext import spelt
+from drivelink.plaintext import clean_text, spelt
 from estimator.model import ParameterValue
 
 _WIDTH = 100  # columns of a result in Python
@@ -108,12 +108,12 @@ def show(sections: Iterable[Section], console: Console) -> None:
     for section in sections:
         for block in section.blocks:
             if isinstance(block, Paragraph):
-                console.print(Text(block.text), soft_wrap=not console.is_terminal)
+                console.print(Text(_plain(block.text)), soft_wrap=not console.is_terminal)
             elif isinstance(block, Grid):
                 console.print(_printed(block, section.title, console))
             elif isinstance(block, Lines):
                 for line in block.lines:
-                    console.print(Text(f"  {line}"), soft_wrap=not console.is_terminal)
+                    console.print(Text(_plain(f"  {line}")), soft_wrap=not console.is_terminal)
 
 
 def as_text(sections: Iterable[Section]) -> str:
@@ -123,19 +123,23 @@ def as_text(sections: Iterable[Section]) -> str:
     return text.getvalue().strip()
 
 
+def _plain(text: str) -> str:
+    return "\n".join(map(clean_text, text.split("\n")))
+
+
 def _printed(grid: Grid, title: str, console: Console) -> Table:
     encoding = console.encoding
     body = [[_text(row[k]) for row in grid.rows if len(row) > 1] for k in range(len(grid.head))]
     widths = [max(map(len, cells), default=0) for cells in body]
     crowded = sum(max(pair) + 3 for pair in zip(widths, map(len, grid.head), strict=True)) >= console.width
-    table = Table(title=spelt(grid.title or title, encoding), title_justify="left")
+    table = Table(title=spelt(_plain(grid.title or title), encoding), title_justify="left")
     room = sum(widths[1:]) + 3 * len(widths) + _NARROWEST <= console.width
     for k, column in enumerate(grid.head):
         left = k == 0 or column == "unit"
         if crowded and column:  # headings fold first
             column = textwrap.fill(column, max(widths[k], *map(len, column.split())))
         table.add_column(
-            spelt(column, encoding),
+            spelt(_plain(column), encoding),
             justify="left" if left else "right",
             overflow="fold",
             no_wrap=k > 0 and room,
@@ -144,7 +148,7 @@ def _printed(grid: Grid, title: str, console: Console) -> Table:
         if len(row) == 1:
             table.add_section()
         style = "bold" if len(row) == 1 or _text(row[0]).startswith("▶") else ""
-        table.add_row(*(Text(spelt(_text(cell), encoding)) for cell in row), style=style)
+        table.add_row(*(Text(spelt(_plain(_text(cell)), encoding)) for cell in row), style=style)
     return table
 
 

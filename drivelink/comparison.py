@@ -6,13 +6,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from drivelink import analysis, jointfile
 from drivelink.errors import RecordingError, UsageError
 from drivelink.output.comparison import Comparison, Side
 from drivelink.output.numbers import Units
 from estimator.errors import EstimatorError
 from estimator.freerun import FreeRun, free_run
-from estimator.model import Effect
+from estimator.model import Effect, JointModel
+from estimator.sample import Record
 
 _SURE = 4.0  # standard deviations of friction that is not declared
 
@@ -47,10 +50,19 @@ def compare(
                     made.append(free_run(side.record, its.model, made[0].horizon_s if made else horizon_s))
                 except EstimatorError as error:
                     which = f"{of}" if of == path else f"{of}, over {path}"
-                    raise RecordingError(f"{which}: {error}") from error
+                    raise RecordingError(f"{which}: {error}{_shorter(side.record, its.model)}") from error
             runs.append((side, made[0], made[1]))
     linear = own is not None and jointfile.load(Path(own)).axis == "linear"
     return Comparison((sides[0], sides[1]), tuple(runs), Units(linear))
+
+
+def _shorter(record: Record, model: JointModel) -> str:
+    """Return which horizon fits between the gaps; empty where the model itself cannot be simulated."""
+    if any(motor.flexible and not motor.transmission.parameters for motor in model.motors):
+        return ""
+    runs = np.split(record.sequence, np.flatnonzero(np.diff(record.sequence) != 1) + 1)
+    rows = max(map(len, runs)) // 2  # windows begin at multiples of their length
+    return f"; --horizon {rows * record.period_s:g} fits between its gaps" if rows > 1 else ""
 
 
 def _side(path: Path, joint: Path | None, names: Sequence[str]) -> Side:

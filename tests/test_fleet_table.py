@@ -16,6 +16,9 @@ from fleetkit import row
 
 pytest.importorskip("distributed", reason="the extra [fleet] is not installed")
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from drivelink.fleet import table
 from drivelink.fleet.page import page
 from drivelink.fleet.storage import FleetError, Source, Store
@@ -75,6 +78,30 @@ def test_a_part_that_is_no_parquet_file_is_one_line(tmp_path):
     (tmp_path / "table" / "part-1.parquet").write_text("garbage")
     with pytest.raises(FleetError, match=r"part-1.parquet: expected a Parquet file"):
         read_rows(Store(str(tmp_path)))
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [(300_000, "at most 10000 rows, got 300000"), (3, "a value in each row of id, got 3 without")],
+)
+def test_a_part_that_no_run_wrote_is_one_line(rows, said, tmp_path):
+    (tmp_path / "table").mkdir()
+    empty = pa.table([pa.nulls(rows, field.type) for field in table.SCHEMA], schema=table.SCHEMA)
+    pq.write_table(empty, tmp_path / "table" / "part-1.parquet")
+    with pytest.raises(FleetError, match=f"part-1.parquet: expected {said}"):
+        read_rows(Store(str(tmp_path)))
+
+
+def test_a_part_whose_texts_are_no_texts_is_one_line(tmp_path):
+    append(tmp_path, row("a"))
+    (part,) = tmp_path.glob("table/*.parquet")
+    good = pq.read_table(part)
+    names = part.read_bytes().replace(b"worker", b"w\xe4rker")
+    pq.write_table(good.set_column(0, "id", pa.array([b"\xe4"]).view(pa.string())), part)
+    for content in (part.read_bytes(), names):
+        part.write_bytes(content)
+        with pytest.raises(FleetError, match=r"expected a Parquet file of drivelink: .*(UTF|utf)"):
+            read_rows(Store(str(tmp_path)))
 
 
 # The summary

@@ -25,6 +25,7 @@ from drivelink.fleet.storage import FleetError, Source, Store
 FOLDER = "table"
 
 _PART_ROWS = 5000  # a part is full: about 2 MB, rewritten in some 0.1 s
+_MOST_ROWS = 2 * _PART_ROWS  # one that is all but full, and the rows of one recording more
 _FLUSH_S = 5.0  # finished work that a power loss may cost
 
 _TEXT, _REAL, _FEW, _MANY = pa.string(), pa.float64(), pa.int16(), pa.int64()
@@ -53,6 +54,7 @@ _INDEX = [
     "id", "joint", "recording", "digest", "size_bytes", "stamp", "status", "version", "accepted_model",
     "written",
 ]  # fmt: skip
+_NEVER_EMPTY = ["id", "recording", "digest", "size_bytes", "status", "written"]
 _Key = tuple[str, str | None]  # digest and joint
 
 
@@ -206,10 +208,22 @@ def read_rows(store: Store, columns: list[str] | None = None) -> list[dict[str, 
 def _read(store: Store, part: str, columns: list[str] | None = None) -> Any:
     """Read a part; columns missing in an older version are empty."""
     wanted = SCHEMA if columns is None else pa.schema([SCHEMA.field(name) for name in columns])
+    content, where = store.read(part), f"{store.url}/{part}"
     try:
-        return pq.read_table(io.BytesIO(store.read(part)), schema=wanted)
-    except pa.ArrowException as error:
-        raise FleetError(f"{store.url}/{part}: expected a Parquet file of drivelink: {error}") from error
+        about = pq.read_metadata(io.BytesIO(content))
+        rows = sum(about.row_group(k).num_rows for k in range(about.num_row_groups))
+        if not 0 <= rows <= _MOST_ROWS:
+            raise FleetError(f"{where}: expected at most {_MOST_ROWS} rows, got {rows}")
+        table = pq.read_table(io.BytesIO(content), schema=wanted)
+        table.validate(full=True)  # texts are UTF-8
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        raise FleetError(f"{where}: expected a Parquet file of drivelink: {error}") from error
+    for name in _NEVER_EMPTY:
+        if name in table.column_names and table[name].null_count:
+            raise FleetError(
+                f"{where}: expected a value in each row of {name}, got {table[name].null_count} without"
+            )
+    return table
 
 
 def _bytes(table: Any) -> bytes:

@@ -93,6 +93,7 @@ pub struct Estimate {
     /// The first `motors` of them.
     pub transmissions: [TransmissionEstimate; MOTORS],
     /// How many motors the joint has.
+    #[serde(deserialize_with = "crate::snapshot::motors")]
     pub motors: usize,
 }
 
@@ -145,5 +146,16 @@ mod tests {
         };
         assert_eq!(totals(Arrangement::Antagonistic), (-3.0, 150.0, 5.0));
         assert_eq!(totals(Arrangement::Serial), (1.0, 100.0, 3.0));
+    }
+
+    #[test]
+    fn bytes_of_more_motors_than_a_joint_has_are_no_snapshot() {
+        for (motors, sound) in [(MOTORS, true), (MOTORS + 1, false), (1 << 40, false)] {
+            let parts = [TransmissionEstimate::NOTHING; MOTORS];
+            let mut estimate = joint_estimate(Arrangement::Serial, 7, status::VALID, parts, 2);
+            estimate.motors = motors;
+            let bytes = crate::snapshot::keep(&estimate).unwrap();
+            assert_eq!(crate::snapshot::restore::<Estimate>(&bytes).is_ok(), sound);
+        }
     }
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +12,9 @@ import joints
 import numpy as np
 import pytest
 
+import drivelink
+from drivelink import jointfile
+from drivelink.demo.simulate import world_from_joint
 from estimator.choices import choice
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.heldout import Held
@@ -18,6 +22,7 @@ from estimator.errors import EstimatorError
 from estimator.identify import identify
 from estimator.model import Effect
 from estimator.sample import FloatArray, Record
+from sim.world import record as simulated
 
 # What is put into each joint, and what must come out: name, location, main parameter, its tolerance.
 # Tolerances: 3 % for what enters linearly, more where the law differs from the library's (friction's shape).
@@ -301,3 +306,19 @@ def test_friction_is_named_where_the_declared_spring_carries_nothing():
     assert first.parameters["torque_nm"] == pytest.approx(0.4, abs=0.02)  # as among the cases above
     assert found.transmissions[0].parameters == {}
     assert any("no positive one fits better than none" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("name", ["constant", "quadratic"])
+def test_rounding_of_a_healthy_joint_as_it_is_packaged_is_no_effect(name):
+    """In its link's balance 3 % of the torque is rounding: less where all inertias and torques shrink alike."""
+    joint = jointfile.load(Path(drivelink.__file__).parent / "joints" / f"{name}.toml")
+    columns = simulated(world_from_joint(joint), 40.0)
+    record = Record(
+        period_s=joint.bus.period_s,
+        sequence=np.arange(len(columns["time_s"])),
+        motor_position_rad=columns["motor1_position_rad"][:, None],
+        motor_torque_nm=columns["motor1_torque_nm"][:, None],
+        link_position_rad=columns["link_position_rad"],
+    )
+    found = diagnose(record, joint.model())
+    assert (found.verdict, found.effects) == ("sufficient", ())

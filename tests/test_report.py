@@ -16,7 +16,7 @@ from rich.console import Console
 from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.jointfile.apply_diagnosis import floor_entry, make_model_monitor
-from drivelink.output import plots, progress
+from drivelink.output import plots, progress, report
 from drivelink.output.document import Grid, Section, show
 from drivelink.output.numbers import Units
 from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
@@ -88,13 +88,20 @@ def test_json_is_pure_and_a_page_without_a_curve_has_no_empty_section(folder, ca
     )
 
 
+@pytest.mark.parametrize(("chosen", "said"), [(0.02, True), (0.005, False)])
+def test_the_report_says_why_another_effect_was_not_chosen(chosen, said):
+    rival = SimpleNamespace(name="asymmetric_friction", error_relative=0.01)
+    outcome = SimpleNamespace(train=SimpleNamespace(after_relative=chosen), rivals=[rival])
+    why = "asymmetric friction alone leaves less: an effect with more freedom"
+    assert (why in report._choice_of(outcome, [chosen])) == said
+
+
 def test_the_report_is_self_contained_and_has_the_verdict_units_bands_the_winner_and_what_is_left(folder):
     _diagnose(folder, "coulomb")
     page = (folder / "coulomb-joint.toml" / "report.html").read_text(encoding="utf-8")
     for part in (
         "The model lacks Coulomb friction (motor)", "of the torque (", "rms) stays unexplained", "What reveals it",
-        "asymmetric friction alone leaves less: an effect with more freedom", ">refitted</text>",
-        "Stiffness of motor 1's transmission, with 95 % bands", "prefers-color-scheme: dark", "currentColor",
+        ">refitted</text>", "Stiffness of motor 1's transmission, with 95 % bands", "prefers-color-scheme: dark", "currentColor",
     ):  # fmt: skip
         assert part in page, part
     for foreign in ("#ffffff", 'src="http', 'href="http', "@import", "<script"):

@@ -189,35 +189,38 @@ class Stack:
             self._add(column, Slot("curve", "", extra.motor, None, p, 0, 0.0), width)
 
     def scales(self, terms: Sequence[Term]) -> tuple[Scale, ...]:
-        """Return the motors' balances against the measured torque."""
-        made = []
-        equations = self._frames[0].equations
-        for i in range(len(self._frames[0].motors)):
-            mine = [j for j, slot in enumerate(self.slots) if slot.motor == i and self._scales(slot)]
+        """Return the motors' balances against the measured torque, and the link's against its inertia."""
+        first, made = self._frames[0], []
+        motors = len(first.motors)
+        for i in range(motors + first.linked):
+            mine = [j for j, slot in enumerate(self.slots) if self._scales(slot, i)]
             if not mine:
                 continue
             slopes = np.stack([self._torque_scale(self.slots[j], terms) for j in mine], axis=1)
             same = bool(np.all(slopes == slopes[0]))
-            groups = tuple(k * equations + i for k in range(len(self._frames)))
+            groups = tuple(k * first.equations + i for k in range(len(self._frames)))
             made.append(Scale(groups, np.array(mine), slopes[:1] if same else slopes))
         return tuple(made)
 
-    def _scales(self, slot: Slot) -> bool:
-        """Whether a slot scales a motor's balance.
+    def _scales(self, slot: Slot, balance: int) -> bool:
+        """Whether a slot scales a balance.
 
         An inertia that the file knows the deviation of does where nothing else has a scale: a stiffness
-        follows it.
+        follows it. No torque is measured of the link's: with its inertia all of it may shrink.
         """
+        if balance == len(self._model.motors):
+            return slot.name == "link_inertia"
         motor = self._model.motors[slot.motor or 0]
         known = motor.inertia_std_relative is not None and not self._frames[0].linked
         alone = known and slot.name == "motor_inertia" and slot.kind == "term"
-        return slot.name in _TORQUE_SCALES or alone
+        return slot.motor == balance and (slot.name in _TORQUE_SCALES or alone)
 
     def _torque_scale(self, slot: Slot, terms: Sequence[Term]) -> FloatArray:
         """(m,) relative change of the acting torque per unit of a slot."""
         values = terms[slot.place].values if slot.kind == "term" else {}
-        if slot.name == "motor_inertia":
-            inertia = self._model.motors[slot.motor or 0].inertia_kg_m2
+        if slot.name in ("motor_inertia", "link_inertia"):
+            link = self._model.link if slot.name == "link_inertia" else None
+            inertia = (link or self._model.motors[slot.motor or 0]).inertia_kg_m2
             return np.full(sum(len(f.motors[0].torque[:: f.rows_step]) for f in self._frames), 1.0 / inertia)
         slope = _TORQUE_SCALES[slot.name]
         return np.concatenate(

@@ -192,14 +192,17 @@ class Signals:
         response = 2.0 * np.pi * frequency * light_response(self)
         return float(np.sqrt(self.noise(self.theta[motor], response)))
 
-    def row_noise(self, motor: int, inertia: float, stiffness: FloatArray) -> float:
-        """Return the variance of a row of a motor's balance by the noise of its positions, (N·m)²."""
+    def row_noise(self, motor: int | None, inertia: float, stiffness: FloatArray) -> float:
+        """Return the variance of a row of a motor's balance, or the link's (None), by its positions' noise,
+        (N·m)².
+        """
+        moved = self.q if motor is None and self.q is not None else self.theta[motor or 0]
         frequency = self.light.frequency_hz
         response = light_response(self) * lowpass(frequency, self.bandwidth_hz)
-        accelerated = inertia**2 * self.noise(self.theta[motor], (2.0 * np.pi * frequency) ** 2 * response)
+        accelerated = inertia**2 * self.noise(moved, (2.0 * np.pi * frequency) ** 2 * response)
         if self.q is None:
             return accelerated
-        read = self.noise(self.theta[motor], response) + self.noise(self.q, response)
+        read = self.noise(self.theta[motor or 0], response) + self.noise(self.q, response)
         return accelerated + float(np.mean(stiffness**2)) * read
 
 

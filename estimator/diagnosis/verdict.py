@@ -183,7 +183,7 @@ class Judge:
 
     def _unlisted(self, curve: Fitted) -> bool:
         """Whether a free curve explains more than all named effects, here and on held-out data."""
-        if not self.held.confirms(curve, self.found):
+        if not self._sure(curve):
             return False
         named = min(self.held.squared(h) for h in (self.found, *self.search.leading()))
         return self.held.squared(curve) < (choice("curve") ** 2 if self.found.terms else 1.0) * named
@@ -191,14 +191,25 @@ class Judge:
     def _remaining(self) -> Fitted | None:
         """A curve for a balance that named effects leave unexplained although its physics is declared."""
         problem, found = self.problem, self.found
-        if not problem.frames[0].linked:
+        declared = problem.model.link
+        if not problem.frames[0].linked or declared is None:
             return None
-        left = found.posterior.sigma / found.regression.floor
+        floor = found.regression.floor.copy()
+        for frame, k in zip(
+            problem.frames, range(problem.equations - 1, len(floor), problem.equations), strict=True
+        ):
+            read = frame.signals.row_noise(None, declared.inertia_kg_m2, frame.motors[0].stiffness)
+            floor[k] = np.hypot(floor[k], np.sqrt(read))
+        left = found.posterior.sigma / floor
         worst = int(np.argmax(left)) % problem.equations
         if float(np.max(left)) < choice("far"):
             return None
         link = worst == problem.equations - 1
         return best_curve(self.search, found, ("link", None) if link else ("motor", worst))
+
+    def _sure(self, curve: Fitted) -> bool:
+        """Whether held-out data surely ask for a curve: the best of several in noise gains a deviation."""
+        return self.held.margin(curve, self.found) > choice("sure")
 
     def _doubts(self, effects: list[Finding]) -> list[str]:
         """What these data cannot decide, one sentence each."""

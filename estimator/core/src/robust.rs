@@ -31,7 +31,7 @@ use crate::suspicion::Suspicion;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Robust {
     arrangement: Arrangement,
-    #[serde(deserialize_with = "crate::snapshot::motors")]
+    #[serde(deserialize_with = "crate::sample::motors")]
     motors: usize,
     flexible: bool,
     period: f64,

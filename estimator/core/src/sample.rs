@@ -93,8 +93,18 @@ pub struct Estimate {
     /// The first `motors` of them.
     pub transmissions: [TransmissionEstimate; MOTORS],
     /// How many motors the joint has.
-    #[serde(deserialize_with = "crate::snapshot::motors")]
+    #[serde(deserialize_with = "crate::sample::motors")]
     pub motors: usize,
+}
+
+/// How many motors a joint has, from bytes: as many as fit into arrays.
+pub(crate) fn motors<'de, D: serde::Deserializer<'de>>(from: D) -> Result<usize, D::Error> {
+    let motors = usize::deserialize(from)?;
+    if motors > MOTORS {
+        Err(serde::de::Error::custom(format!("a joint of {motors} motors")))
+    } else {
+        Ok(motors)
+    }
 }
 
 /// The joint's estimate from its transmissions' own (eqs 9, 11); variances of independent ones add.

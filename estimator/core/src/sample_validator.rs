@@ -44,7 +44,7 @@ pub struct Accepted {
 /// rest while the motors go on, as under a controller, is no fault, nor is a motor that friction stops.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SampleValidator {
-    #[serde(deserialize_with = "crate::snapshot::motors")]
+    #[serde(deserialize_with = "crate::sample::motors")]
     motors: usize,
     flexible: bool,
     period: f64,

@@ -6,7 +6,6 @@ use serde::de::{DeserializeOwned, Error as _};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::error::Error;
-use crate::sample::MOTORS;
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
@@ -72,12 +71,6 @@ pub(crate) mod rows {
         made.as_flattened_mut().copy_from_slice(&values);
         Ok(made)
     }
-}
-
-/// How many motors there are: as many as fit into arrays.
-pub(crate) fn motors<'de, D: Deserializer<'de>>(from: D) -> Result<usize, D::Error> {
-    let motors = usize::deserialize(from)?;
-    if motors > MOTORS { Err(D::Error::custom(format!("a joint of {motors} motors"))) } else { Ok(motors) }
 }
 
 fn fitting<'de, D: Deserializer<'de>>(values: Vec<f64>) -> D::Error {

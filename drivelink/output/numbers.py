@@ -23,7 +23,7 @@ def number(value: float, digits: int = 4) -> str:
 def axis_labels(values: Sequence[float]) -> list[str]:
     """Return the labels of an axis' even places: one power of ten, and two digits of their distance."""
     largest, apart = max(map(abs, values)), abs(values[1] - values[0])
-    if not (math.isfinite(apart) and apart > 0.0):
+    if not (math.isfinite(largest) and math.isfinite(apart) and apart > 0.0):
         return [number(value) for value in values]
     return [_to_place(value, largest, math.floor(math.log10(apart)) - 1) for value in values]
 

@@ -285,7 +285,7 @@ impl Blocks {
         let Some(known) = self.posterior.as_ref().filter(|_| self.is_reference()) else { return 1.0 };
         let rest = (1.0 - row[balance::DRY].powi(2)).max(0.0);
         let open = rest * known.x[DRY].powi(2);
-        self.noise.variance / (self.noise.variance + open)
+        if open > 0.0 { self.noise.variance / (self.noise.variance + open) } else { 1.0 }
     }
 
     /// Whether the latest rows are neither noise, nor as large as what explained blocks have held, nor uncertain.

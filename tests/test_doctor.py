@@ -145,7 +145,7 @@ def test_a_moving_joint_passes_the_gate_of_recordings_and_a_fault_is_named_with_
 
 
 def test_where_samples_are_lost_what_seems_right_is_no_verdict(monkeypatch):
-    monkeypatch.setattr("drivelink.doctor.motion._busy", lambda _: True)
+    monkeypatch.setattr("drivelink.doctor.motion._is_sparse", lambda _: True)
     (finding,) = live().notices
     assert finding.severity is Severity.INFO and finding.fix.startswith("this machine is too busy")
 

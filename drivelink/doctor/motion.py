@@ -49,7 +49,7 @@ def judge_record(section: Section, joint: JointFile, record: Record | None) -> N
 
 def _advice(record: Record) -> str:
     """Return what would decide what could not be decided."""
-    if _busy(record):
+    if _is_sparse(record):
         return _LOST
     for position in record.motor_position_rad.T:
         steps = np.abs(np.diff(position))
@@ -59,8 +59,8 @@ def _advice(record: Record) -> str:
     return _STILL
 
 
-def _busy(record: Record) -> bool:
-    """Return whether so many samples are missing that what is left says little."""
+def _is_sparse(record: Record) -> bool:
+    """Return whether so many samples are missing that the rest says little."""
     return len(record) < (1.0 - _MOST_LOST) * int(record.sequence[-1] - record.sequence[0] + 1)
 
 
@@ -80,7 +80,7 @@ def _report_judgement(section: Section, joint: JointFile, judgement: Judgement, 
     else:
         left = percent(judgement.left, 1)
         text = f"no unit or sign of positions and torque looks wrong: the torque balance leaves {left}"
-        if _busy(record):
+        if _is_sparse(record):
             section.info(joint.name, text, _LOST)
         else:
             section.ok(joint.name, text)

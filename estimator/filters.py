@@ -10,7 +10,31 @@ from estimator import _core
 from estimator.model import require_finite
 from estimator.sample import FloatArray
 
-__all__ = ["StateVariableFilter"]
+__all__ = ["StateVariableFilter", "smoothed"]
+
+_CUBIC = 3
+
+
+def smoothed(signal: FloatArray, rows: int, derivative: int, period_s: float) -> FloatArray:
+    """Return a derivative of the cubic that fits best around each sample (Savitzky and Golay).
+
+    Args:
+        signal: (n, c).
+        rows: samples of a cubic, an odd number; the first and the last one reach to the ends.
+        derivative: 0: the signal itself.
+        period_s: of the samples.
+
+    Returns:
+        (n, c), in the signal's unit per s^derivative.
+    """
+    half = rows // 2
+    places, powers = np.arange(-half, half + 1.0), np.arange(derivative, _CUBIC + 1)
+    windows = np.lib.stride_tricks.sliding_window_view(signal, rows, axis=0)
+    cubics = (windows @ np.linalg.pinv(np.vander(places, _CUBIC + 1, increasing=True)).T)[..., powers]
+    cubics = cubics * [math.perm(power, derivative) for power in powers]
+    at = places[:, None] ** (powers - derivative)
+    ends = (at[:half] @ cubics[0].T, cubics[:, :, 0], at[half + 1 :] @ cubics[-1].T)
+    return np.asarray(np.concatenate(ends) / period_s**derivative)
 
 
 class StateVariableFilter:

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from estimator.effects import Coordinates, EffectType, elements
 from estimator.errors import EstimatorError
+from estimator.filters import smoothed
 from estimator.gate import without_hold
 from estimator.model import Effect, JointModel, Transmission
 from estimator.sample import FloatArray, Record
@@ -25,7 +25,6 @@ __all__ = ["Bodies", "FreeRun", "free_run", "nrmse_fit"]
 
 _RESOLVED = 0.1
 _SMOOTHED = 21
-_CUBIC = 3
 _STEP = 1e-6
 
 Element = tuple[EffectType, Mapping[str, float]]
@@ -162,8 +161,7 @@ class Bodies:
         if len(record) < _SMOOTHED:
             raise EstimatorError(f"expected at least {_SMOOTHED} samples for a free run, got {len(record)}")
         self.smoothed, self.rate = (
-            savgol_filter(self.measured, _SMOOTHED, _CUBIC, order, delta=record.period_s, axis=0)
-            for order in (0, 1)
+            smoothed(self.measured, _SMOOTHED, order, record.period_s) for order in (0, 1)
         )
         self.state = self.smoothed.copy()
         self.state[:, -1] -= self.reading_error(self.smoothed[:, -1], self.rate[:, -1])

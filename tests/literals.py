@@ -160,7 +160,7 @@ NO_CHOICE = {  # mathematics, units, rounding, and what a format or the literatu
     "driven._PASSES": "of a fixed point whose error falls by the effect's share each time",
     "driven._STEP": "of a difference: square root of the rounding, in rad",
     "flexibility.RELATIVE_STEP": "of central differences: cube root of the rounding",
-    "freerun._CUBIC": "least degree whose slope is exact to second order",
+    "filters._CUBIC": "least degree whose slope is exact to second order",
     "freerun._RESOLVED": "radians of an oscillation in a second-order step: its frequency is 0.04 % off",
     "freerun._SMOOTHED": "samples: the least that average an encoder's rounding, short of the motion's bends",
     "freerun._STEP": "of a difference: square root of the rounding, in rad/s",

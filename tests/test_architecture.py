@@ -54,6 +54,10 @@ def test_the_package_imports_nothing_beyond_what_it_may(package):
             calls = (node.func for node in nodes_of(path) if isinstance(node, ast.Call))
             names = {func.id for func in calls if isinstance(func, ast.Name)}
             assert not names & {"open", "print", "input"}, f"{path.relative_to(ROOT)}"
+            slow = r"^(from|import) scipy\.(signal|stats)\b"  # each takes as long to load as all the rest
+            assert not re.search(slow, path.read_text(encoding="utf-8"), re.MULTILINE), (
+                f"{path.relative_to(ROOT)}"
+            )
 
 
 def test_every_number_that_the_estimator_chooses_is_in_a_table():

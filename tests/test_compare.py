@@ -23,6 +23,7 @@ from drivelink.errors import DrivelinkError
 from drivelink.output.comparison import fits
 from drivelink.output.document import show
 from estimator import Effect, EstimatorError, JointModel, LinkDynamics, Motor, Record, Transmission
+from estimator.filters import smoothed
 from estimator.freerun import free_run, nrmse_fit
 from sim.world import record
 
@@ -180,6 +181,15 @@ def test_the_horizon_shrinks_until_a_drifting_run_fits_and_windows_with_a_gap_ar
     assert chosen.horizon_s < 1.5 and min(chosen.fit_percent.values()) > 0.0
     gap = np.arange(len(truth)) + 7 * (np.arange(len(truth)) > 750)
     assert len(free_run(replace(truth, sequence=gap), joint(), 0.5).time_s) == 1000
+
+
+@pytest.mark.parametrize("rows", [5, 21])
+def test_a_cubic_is_smoothed_to_itself_up_to_both_ends(rows):
+    t = 0.1 * np.arange(40)
+    cubics = np.stack((t**3 - 2 * t, 1 + t**2), axis=1)
+    rates, bends = np.stack((3 * t**2 - 2, 2 * t), axis=1), np.stack((6 * t, 2 + 0 * t), axis=1)
+    for derivative, expected in enumerate((cubics, rates, bends)):
+        np.testing.assert_allclose(smoothed(cubics, rows, derivative, 0.1), expected, atol=1e-9)
 
 
 def test_what_cannot_be_simulated_is_one_line_and_the_fit_figure_is_that_of_matlab_s_compare():

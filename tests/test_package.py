@@ -73,7 +73,7 @@ import pydoc, sys
 def without(*names): assert not {*names} & {*sys.modules}, {*names} & {*sys.modules}
 import drivelink
 without("numpy", "scipy", "matplotlib", "zenoh")
-import drivelink.daemon.service  # twice the time to start, and 80 MB
+import drivelink.cli.record, drivelink.daemon.service  # twice the time to start, and 80 MB
 without("scipy", "matplotlib")
 import drivelink.cli, drivelink.cli.run, drivelink.cli.fleet
 without("dask", "distributed", "fsspec", "pyarrow", "pandas", "botocore", "paramiko")

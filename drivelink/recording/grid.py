@@ -11,8 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import minimum_filter1d
 
 from drivelink.cycle.syncclock import slope_of
 from drivelink.errors import RecordingError
@@ -138,6 +136,8 @@ def _number_jittered(time: FloatArray, where: str) -> tuple[NDArray[np.int64], f
 
     A number is the previous one plus one, plus the periods by which all stamps of the next window are behind.
     """
+    from scipy.ndimage import minimum_filter1d  # most stamps need no scipy, and `record` none
+
     index = np.arange(len(time))
     since = time - time[0]
     lag = max(1, min(_AHEAD, len(time) // 4))
@@ -209,6 +209,8 @@ def resampled(columns: Mapping[str, FloatArray], rows: NDArray[np.bool_]) -> dic
         columns: (n,) each, `time_s` among them; all finite in the rows used.
         rows: (n,) that are used; their stamps increase.
     """
+    from scipy.interpolate import PchipInterpolator  # as above
+
     time = columns["time_s"][rows]
     period = float(np.median(np.diff(time)))
     grid = time[0] + period * np.arange(int((time[-1] - time[0]) / period))

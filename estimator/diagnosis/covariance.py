@@ -14,7 +14,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.hypothesis import Fitted
@@ -43,7 +43,7 @@ def hac_covariance(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> Fl
     """
     free, moderated, freedom = _moderated(problem, fitted, surplus)
     out = np.zeros((len(fitted.posterior.x),) * 2)
-    wider = student.ppf(NormalDist().cdf(SIGMA_95), freedom) / SIGMA_95
+    wider = stdtrit(freedom, NormalDist().cdf(SIGMA_95)) / SIGMA_95
     unit = _unit(fitted, free) * wider
     out[np.ix_(free, free)] = moderated * np.outer(unit, unit)
     return out + sum(_attenuated(problem, fitted, i) for i in range(len(problem.model.motors)))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.signal import lfilter
+from scipy.linalg import solve_banded
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import reverses
@@ -159,8 +159,10 @@ def _creeping(shortest_s: float, longest_s: float) -> Basis:
         period, made = float(c.time[1] - c.time[0]), []
         for lag in lags_s:
             keep = math.exp(-period / lag)
-            start = np.array([keep * c.deflection[0]])
-            made.append(lfilter([1.0 - keep], [1.0, -keep], c.deflection, zi=start)[0])
+            pulled = (1.0 - keep) * c.deflection
+            pulled[0] = c.deflection[0]
+            steps = np.array([[1.0], [-keep]]) + np.zeros(len(pulled))  # y[k] - keep y[k-1] = pulled[k]
+            made.append(solve_banded((1, 0), steps, pulled))
         return np.stack(made, axis=1)
 
     return basis

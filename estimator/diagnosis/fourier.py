@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from estimator.choices import choice
 from estimator.driven import Path
+from estimator.filters import smoothed
 from estimator.sample import FloatArray, Record
 
 __all__ = ["Limits", "Shape"]
@@ -143,7 +143,4 @@ def _rates(record: Record) -> list[FloatArray]:
     theta, period = record.motor_position_rad, record.period_s
     rows = max(round(choice("motion_smoothing") / period) // 2 * 2 + 1, _CUBIC + 2)
     rows = min(rows, (len(theta) - 1) // 2 * 2 + 1)
-    return [
-        np.max(np.abs(savgol_filter(theta, rows, _CUBIC, order, delta=period, axis=0)), axis=0)
-        for order in (1, 2)
-    ]
+    return [np.max(np.abs(smoothed(theta, rows, order, period)), axis=0) for order in (1, 2)]

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import Bounds, differential_evolution, lsq_linear
-from scipy.stats import qmc
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import Candidate, grid
@@ -91,6 +90,8 @@ def design(
     Raises:
         EstimatorError: there are no rivals, or no motion within the limits.
     """
+    from scipy.stats import qmc  # takes as long to load as all the rest
+
     progress("rivals")
     problem = Problem(records, model, outcome.bandwidth_hz)
     inside = limits or Limits.declared(records)

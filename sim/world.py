@@ -240,22 +240,28 @@ def record(world: World, seconds: float) -> dict[str, NDArray[np.float64]]:
         if k:
             world.advance()
         rows.append(_row(world))
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]} if rows else {}
+    if not rows:
+        return {}
+    values = iter(np.array(rows).T)
+    columns = {"time_s": next(values)}
+    truth = {f"truth_{name}": next(values) for name in Truth._fields[1:3]}
+    columns["external_torque_nm"] = next(values)
+    truth |= {f"truth_{name}": next(values) for name in Truth._fields[4:6]}
+    for motor, drive in enumerate(world.drives, start=1):
+        counts, rate, columns[f"motor{motor}_current_a"] = next(values), next(values), next(values)
+        columns[f"motor{motor}_position_rad"] = counts / drive.counts_per_rad
+        columns[f"motor{motor}_velocity_rad_s"] = rate * drive.direction / drive.gear_ratio
+        columns[f"motor{motor}_torque_nm"] = (
+            columns[f"motor{motor}_current_a"] * drive.joint_torque_per_ampere
+        )
+        truth |= {f"truth_motor{motor}_{name}": next(values) for name in MotorTruth._fields}
+    encoder = world.encoder
+    columns["link_position_rad"] = next(values) / encoder.counts_per_rad + encoder.zero_rad
+    return columns | truth
 
 
-def _row(world: World) -> dict[str, float]:
-    truth = world.truth()
-    row = {"time_s": truth.time_s, "external_torque_nm": truth.external_torque_nm}
-    for motor, drive in enumerate(world.drives):
-        signals, name = world.drive(motor), f"motor{motor + 1}"
-        row[f"{name}_position_rad"] = signals.position_counts / drive.counts_per_rad
-        row[f"{name}_velocity_rad_s"] = signals.velocity_rad_s * drive.direction / drive.gear_ratio
-        row[f"{name}_torque_nm"] = signals.current_a * drive.joint_torque_per_ampere
-        row[f"{name}_current_a"] = signals.current_a
-    row["link_position_rad"] = world.link_counts() / world.encoder.counts_per_rad + world.encoder.zero_rad
-    for name in ("link_position_rad", "link_velocity_rad_s", "flexibility_torque_nm", "stiffness_nm_rad"):
-        row[f"truth_{name}"] = getattr(truth, name)
-    for index, motor_truth in enumerate(truth.motors):
-        for name, value in zip(motor_truth._fields, motor_truth, strict=True):
-            row[f"truth_motor{index + 1}_{name}"] = value
-    return row
+def _row(world: World) -> tuple[float, ...]:
+    """Return the truth, what each drive reads and the truth of its motor, and the link encoder's counts."""
+    *whole, motors = world.truth()
+    each = [value for motor, truth in enumerate(motors) for value in (*world.drive(motor)[:3], *truth)]
+    return (*whole, *each, world.link_counts())

@@ -59,9 +59,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def swept():
-    """What a file leaves is collected before the next one."""
+    """What a file leaves is collected before the next one; what it keeps for others is not looked through again."""
     yield
     gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """A joint whose motor a controller holds while a hand moves the link, with presliding friction (Dahl)."""
 
 import math
+from functools import cache
 
 import joints
 import numpy as np
@@ -16,6 +17,7 @@ COUNT = 2.0 * math.pi / 2**21
 NAN = (math.nan,)
 
 
+@cache
 def moved(seconds, kp=KP, hand_rad=0.02):
     """Samples of a held motor whose link a hand moves along a sum of eight sines."""
     rng = np.random.default_rng(4)

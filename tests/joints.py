@@ -173,7 +173,11 @@ def pulled(
         return np.asarray(400.0 * (wanted - state[:, :1]) - 14.0 * state[:, 1:2])
 
     truth = simulate(
-        Plants(torque, stiffness, 0.12, 0.8, load, 0.3, 3.0, more=more), follow, period_s, size=(n, 1, 1)
+        Plants(torque, stiffness, 0.12, 0.8, load, 0.3, 3.0, more=more),
+        follow,
+        period_s,
+        size=(n, 1, 1),
+        method=HEUN,
     )
     noise = np.random.default_rng(5).normal(0, 0.02, (n, 1))
     how = {"motor_counts": 131072, "link_bits": 18, "velocity_rad_s": None, "torque_noise": noise}
@@ -194,7 +198,11 @@ def guided(
         return np.asarray(-0.33 * state[:, 1:2])
 
     truth = simulate(
-        Plants(torque, stiffness, 0.12, 0.8, load, 0.13, 0.02, more=hand), damp, 1e-3, size=(n, 1, 1)
+        Plants(torque, stiffness, 0.12, 0.8, load, 0.13, 0.02, more=hand),
+        damp,
+        1e-3,
+        size=(n, 1, 1),
+        method=HEUN,
     )
     noise = np.random.default_rng(5).normal(0, 0.0125, (n, 1))
     how = {"motor_counts": 8192, "link_bits": 17, "velocity_rad_s": None}

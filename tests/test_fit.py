@@ -149,6 +149,7 @@ def test_command_writes_json_plots_and_a_joint_file_that_loads(elbow, tmp_path, 
     capsys.readouterr()
     # A result is printed before any file is written: what cannot be written takes nothing else with it.
     (tmp_path / "taken").write_text("a file")
+    joints.write_csv(joints.part(_record(truth, 2), slice(3000)), tmp_path / "run.csv")
     assert main([*args, str(tmp_path / "taken" / "out")]) != 0
     said = capsys.readouterr()
     assert "torque balance" in said.out and "taken" in said.err and said.err.count("\n") == 1

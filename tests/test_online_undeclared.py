@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from functools import cache
 
 import heldmotor
 import joints
@@ -65,6 +66,7 @@ def test_a_spring_of_another_stiffness_on_either_side_is_named_and_right():
     assert np.median(np.abs(out[:, 3] / truth.sigma[-6000:, 0, 0] - 1.0)) < 0.005
 
 
+@cache
 def read(*stiffness):
     """A polynomial spring that a motor bends for twelve seconds: the truth, what is read, what is declared."""
     plants = joints.Plants(*joints.polynomial(np.array(stiffness)), 0.12, 0.8, 0.45, 0.3, 3.0)
@@ -127,7 +129,7 @@ def test_friction_at_rest_is_no_hysteresis():
     def torque(k, state):
         return 60.0 * (path[k] - path[0] - state[:, :1]) - 4.0 * state[:, 1:2]
 
-    truth = joints.simulate(plants, torque, T, size=(len(path), 1, 1))
+    truth = joints.simulate(plants, torque, T, size=(len(path), 1, 1), method=joints.HEUN)
     noise = np.random.default_rng(5).normal(0.0, 0.02, (len(path), 1))
     record = joints.record(truth, 0, T, motor_counts=8192, link_bits=17, torque_noise=noise)
     joint = joints.joint_model(0.12, 0.8, model="polynomial", order=2, parameters={})

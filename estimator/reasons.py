@@ -33,6 +33,7 @@ REASONS: dict[str, str] = {
     "beyond": "the deflection is larger than any that was learned from",
     "changed": "{changes} changed",
     "lost": "the zero between the encoders, or the torque's, is not known: move the joint, or home it",
+    "lever": "motor 2 has set another stiffness: it is learned anew",
 }
 
 CHANGES: dict[str, str] = {

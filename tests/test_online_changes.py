@@ -1,5 +1,7 @@
 """What changes is found, what only is not declared is no change, and what was fitted is not left for a wrong value."""
 
+from dataclasses import replace
+
 import joints
 import numpy as np
 import onlinekit as kit
@@ -40,6 +42,40 @@ def run(seconds, *, scale_at=(np.inf, 1.0), coulomb=0.0, seed=11):
 
 def has(out, bit):
     return out[:, 1].astype(int) & int(bit) > 0
+
+
+def test_where_the_lever_of_a_serial_joint_goes_its_spring_is_learned_anew():
+    """What is declared, and what was learned, is of another lever: nothing is valid then, and why is said."""
+    at, again, n = 5000, 8500, 11000  # eight blocks of motion, and the filters, after the lever has moved
+    rng, alpha = np.random.default_rng(3), np.array([[[120.0, 2400.0]]])
+    inertia, damping = np.array([[0.1]]), np.array([[0.6]])
+    plants = joints.Plants(
+        *joints.polynomial(alpha), inertia, damping, 0.45, 0.3, 3.0, scale_at=(at * T, 1.6)
+    )
+    truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, 7.0, 3.0), T)
+    record = joints.record(truth, 0, T, motor_counts=8192, link_bits=17, velocity_rad_s=None)
+    lever = np.interp(np.arange(n), [at - 100, at + 100], [0.1, 0.4])
+    record = replace(
+        record,
+        motor_position_rad=np.column_stack([record.motor_position_rad, lever]),
+        motor_torque_nm=np.column_stack([record.motor_torque_nm, rng.normal(0.0, 0.01, n)]),
+    )
+    declared = {"coefficients_nm_rad": (120.0, 2400.0)}
+    (carrying,) = joints.joint_model(0.1, 0.6, parameters=declared).motors
+    setting = Motor(inertia_kg_m2=0.01, transmission=Transmission(model="none"))
+    estimator = make_estimator(
+        JointModel(arrangement="serial", motors=(carrying, setting)), EstimatorSettings(), T
+    )
+    out, reasons = [], []
+    for sample in record.samples():
+        out.append(estimator.step(sample)[:5])
+        reasons.append(estimator.why())
+    out = np.array(out)
+    error = np.abs(out[:, 3] / truth.sigma[:, 0, 0] - 1)
+    valid = has(out, Status.VALID)
+    assert np.mean(valid[1000:at]) > 0.95 and np.max(error[1000:at][valid[1000:at]]) < 0.02
+    assert not np.any(valid[at : at + 1500]) and reasons[at + 1500][0] == "lever"
+    assert np.mean(valid[again:]) > 0.95 and np.max(error[at:][valid[at:]]) < 0.05
 
 
 @pytest.mark.parametrize("factor", [0.9, *(pytest.param(f, marks=pytest.mark.slow) for f in (0.8, 1.25))])

@@ -86,6 +86,7 @@ choices! {
     NEAR: f64 = 0.01, "jump", "a zero that comes back so near is as it was", "jumps are whole counts";
     SLOW: f64 = 0.02, "largest velocity", "over which dry friction changes its sign, and below which nothing is learned", "Stribeck speeds are faster";
     JUMP_RAD: f64 = 1e-3, "rad", "smallest jump of a position", "acceleration moves a joint less in a period";
+    LEVER_RAD: f64 = 0.02, "rad", "by which motor 2 of a serial joint makes another stiffness", "a lever of one radian changes it by 4 %";
     WILD_RAD_S2: f64 = 100.0, "rad/s²", "acceleration of the bare motor below which no torque is a surprise", "small drives reach it";
     TAUGHT_RAD2_S2: f64 = 1e-6, "rad²/s²", "mean square of φ′ from which eq 32 learns", "a count of 13 bits in a second";
     ONE_WAY: f64 = 0.9, "", "mean direction of a motion that goes one way", "less than a twentieth goes back";

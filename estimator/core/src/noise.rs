@@ -1,5 +1,5 @@
-//! Encoder noise from third differences of the readings, at least the uniform rounding of a count (variance
-//! 1/12 count²).
+//! Encoder noise from third differences of the readings, at least the uniform rounding of a step (variance 1/12 step²):
+//! of a count, or of a reading that is renewed less often than it is sent and moves on by more than a count.
 
 use crate::choices::{FAR, NOISE_S};
 use serde::{Deserialize, Serialize};
@@ -13,6 +13,8 @@ pub struct NoiseMeter {
     known: u8,
     seen: f64,
     measured: f64,
+    stair: f64,  // square of the step at hand; 0: it moves on in every period
+    stairs: f64, // its mean
 }
 
 impl NoiseMeter {
@@ -36,6 +38,11 @@ impl NoiseMeter {
             return;
         }
         self.seen += 1.0;
+        let gain = (period_s / NOISE_S).max(1.0 / self.seen).min(1.0);
+        if value != a {
+            self.stair = if a == b { (value - a).powi(2) } else { 0.0 };
+        }
+        self.stairs += gain * (self.stair - self.stairs);
         let third = value - 3.0 * a + 3.0 * b - c;
         let square = THIRD * third * third;
         if self.measured == 0.0 {
@@ -43,14 +50,14 @@ impl NoiseMeter {
             self.measured += square / self.seen.max(1.0);
             return;
         }
-        let gain = (period_s / NOISE_S).max(1.0 / self.seen).min(1.0);
         self.measured += gain * (square.min(FAR * FAR * self.measured) - self.measured);
     }
 
     /// rad², with the resolution that has been seen (∞: none).
     #[must_use]
     pub fn variance(&self, resolution: f64) -> f64 {
-        let rounding = if resolution.is_finite() { resolution * resolution / 12.0 } else { 0.0 };
+        let rounding =
+            if resolution.is_finite() { self.stairs.max(resolution * resolution) / 12.0 } else { 0.0 };
         self.measured.max(rounding)
     }
 }
@@ -67,6 +74,16 @@ mod tests {
         }
         assert!(meter.variance(f64::INFINITY) < 1e-18);
         assert!((meter.variance(1e-3) - 1e-6 / 12.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_reading_that_is_renewed_every_twentieth_period_is_as_coarse_as_its_steps() {
+        let mut meter = NoiseMeter::default();
+        for k in 0..4000 {
+            meter.update(1e-3 * f64::from(k / 20 * 20), 1e-3);
+        }
+        let (found, step) = (meter.variance(1e-5), 0.02);
+        assert!((found / (step * step / 12.0) - 1.0).abs() < 0.05, "{found}"); // 5 %: the first step's start
     }
 
     #[test]

@@ -29,6 +29,8 @@ pub enum Reason {
     Changed,
     /// Where the zero between the encoders is has not been found again.
     Lost,
+    /// Motor 2 of a serial joint has set another stiffness, of which nothing has been learned yet.
+    Lever,
 }
 
 impl Reason {
@@ -47,6 +49,7 @@ impl Reason {
             Reason::Beyond => "beyond",
             Reason::Changed => "changed",
             Reason::Lost => "lost",
+            Reason::Lever => "lever",
         }
     }
 

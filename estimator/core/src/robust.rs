@@ -62,8 +62,9 @@ struct Live {
     torque_noise: [NoiseMeter; MOTORS],
     zeros: Positions, // where the encoders' zeros have moved to
     last: Inputs,
-    zeros_known: bool,                 // or what the next sample is held against
-    begins: bool,                      // with the next sample that the corrections let pass …
+    lever: f64,        // position of a serial joint's motor 2 for which its spring is learned, rad
+    zeros_known: bool, // or what the next sample is held against
+    begins: bool,      // with the next sample that the corrections let pass …
     jumped: Option<[f64; MOTORS + 1]>, // … after encoders moved their zeros
     started: bool,
     tick: u64,
@@ -87,6 +88,7 @@ impl Live {
             torque_noise: [NoiseMeter::default(); MOTORS],
             zeros: Positions::default(),
             last: Inputs::default(),
+            lever: f64::NAN,
             zeros_known: true,
             begins: true,
             jumped: None,

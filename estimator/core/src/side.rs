@@ -74,6 +74,7 @@ pub struct Side {
     fits: bool,
     unexplained: f64,
     unconfirmed_s: f64, // of rows after an encoder has moved its zero
+    renewed: bool,      // a lever has been moved
 }
 
 impl Side {
@@ -120,6 +121,7 @@ impl Side {
             fits: false,
             unexplained: f64::NAN,
             unconfirmed_s: 0.0,
+            renewed: false,
         };
         made.reset();
         made
@@ -135,7 +137,16 @@ impl Side {
         self.excitation = Excitation::default();
         (self.effect, self.transmitted, self.acting, self.stiffness) = (0.0, 0.0, 0.0, 0.0);
         (self.excited, self.held_s, self.doubtful) = (false, 0.0, false);
-        (self.followed_s, self.unconfirmed_s) = (0.0, 0.0);
+        (self.followed_s, self.unconfirmed_s, self.renewed) = (0.0, 0.0, false);
+        self.judge();
+    }
+
+    /// A lever has been moved: neither what has been learned of the spring nor what is declared is of this one.
+    pub fn renew(&mut self) {
+        self.blocks.relearn();
+        self.blocks.spring.open();
+        self.blocks.posterior = None;
+        self.renewed = true;
         self.judge();
     }
 

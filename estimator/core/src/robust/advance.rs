@@ -2,6 +2,7 @@
 
 use super::Robust;
 use crate::align::{Inputs, Positions};
+use crate::choices::LEVER_RAD;
 use crate::external::Carried;
 use crate::model::Arrangement;
 use crate::noise::NoiseMeter;
@@ -29,6 +30,9 @@ impl Robust {
     pub(super) fn advance(&mut self, now: &Inputs) {
         let usable = self.live.unsettled <= 0;
         self.live.tick += 1;
+        if self.arrangement == Arrangement::Serial {
+            self.follow_lever(now.at.motor[1]);
+        }
         self.live.link.smooth(&self.filters, now.at.link);
         self.measure_noise(now, usable);
         let shifts = self.learn(now, usable);
@@ -36,6 +40,17 @@ impl Robust {
         self.live.last = *now;
         self.live.unsettled -= 1;
         self.apply(&shifts);
+    }
+
+    /// Motor 2 of a serial joint sets the stiffness: where it goes, the spring is learned anew.
+    fn follow_lever(&mut self, position: f64) {
+        let moved = (position - self.live.lever).abs() > LEVER_RAD;
+        if moved {
+            self.sides[0].renew();
+        }
+        if moved || self.live.lever.is_nan() {
+            self.live.lever = position;
+        }
     }
 
     /// Each motor's row, and by what it says that inputs are to be shifted.

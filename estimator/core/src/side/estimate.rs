@@ -84,8 +84,12 @@ impl Side {
         }
         let nothing = self.blocks.posterior.is_none();
         if nothing || self.blocks.is_unconfirmed() {
-            let unmoved = if self.blocks.is_lost() { Reason::Lost } else { Reason::Unmoved };
-            return Some(if settled { unmoved } else { Reason::Settling });
+            return Some(match self.renewed {
+                _ if !settled => Reason::Settling,
+                _ if self.blocks.is_lost() => Reason::Lost,
+                true => Reason::Lever,
+                false => Reason::Unmoved,
+            });
         }
         if self.doubtful {
             return Some(if self.blocks.is_suspected() { Reason::Lost } else { Reason::Changed });

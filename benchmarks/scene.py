@@ -90,7 +90,7 @@ def main(
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the rows there")
     args = parser.parse_args()
     kept = table(columns, rows(args), lambda line: print(line, flush=True))
+    if args.json:  # first: what is said after them may end the program
+        args.json.write_text(json.dumps(kept, indent=1, default=str) + "\n", encoding="utf-8")
     if after is not None and kept and (text := after(kept)):
         print(f"\n{text}")
-    if args.json:
-        args.json.write_text(json.dumps(kept, indent=1, default=str) + "\n", encoding="utf-8")

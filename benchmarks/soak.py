@@ -13,6 +13,9 @@ number of cycles: the same faults on a machine that has other things to do. Memo
 resident set after a collection, with the C library's allocator alone, so that what is freed
 is seen to be (Python's own keeps it); threads are counted. Both must be flat once the first minute,
 in which buffers fill, is over: medians of the first and the last third are compared.
+
+Episodes are written to stderr as they come, and how far it is once a minute. Ctrl-C, SIGTERM and so
+`timeout 300 python benchmarks/soak.py …` end it after the fault that is on, with its report.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ import gc
 import logging
 import os
 import random
+import signal
 import sys
 import threading
 import time
@@ -128,25 +132,40 @@ class Soak:
         self.wrong: list[Episode] = []
         self.slowest = (0.0, "")
         self.said = 0
+        self._stopped, self._next_s = False, 0.0
+
+    def stop(self, *_: object) -> None:
+        """End after the fault that is on."""
+        self._stopped = True
 
     def run(self) -> dict[str, Any]:
         """Play faults until the time is over; what was counted."""
-        lockstep, done = self._options.lockstep, 0.0
+        lockstep, done, over = self._options.lockstep, 0.0, False
         while True:  # with another daemon after one that has not become well again
             stage = LockstepStage(vsa(), setattr) if lockstep else RealStage(vsa(), together=True)
             start, well = self._time_s(stage) - done, True
             try:
                 stage.settle()
-                while well and done < self._options.seconds:
+                while well and not over:
                     well = self._one(stage)
                     done = self._time_s(stage) - start
+                    over = self._stopped or done >= self._options.seconds
                     self.rows.append((done, *measured(stage)))
+                    self._tell(done)
                 document = stage.document()
                 self.counted.update({key: document[key] for key in COUNTED}, samples_checked=stage.checked)
-                if well:
+                if over:
                     return self._summary(done)
             finally:
                 stage.close()
+
+    def _tell(self, done: float) -> None:
+        """Write how far it is, once a minute."""
+        if time.monotonic() < self._next_s:
+            return
+        self._next_s = time.monotonic() + 60.0
+        counts = f"{sum(self.played.values())} faults, {len(self.wrong)} wrong episodes"
+        print(f"seed {self._options.seed}: {done:.0f} s, {counts}", file=sys.stderr, flush=True)
 
     def _time_s(self, stage: Stage) -> float:
         in_cycles = self._options.lockstep
@@ -163,12 +182,12 @@ class Soak:
         except AssertionError as error:
             lost = str(error)
         self.slowest = max(self.slowest, (self._time_s(stage) - ended, names))
+        stage.run(self._draw.uniform(0.0, 1.0))
         self.said += len(stage.said.lines)
         for what in filter(None, (stage.wrong_samples(), wrong_value(stage), lost)):
             self.wrong.append(Episode(self._options.seed, stage.daemon.loop.cycles, names, what))
             print(*self.wrong[-1], sep="; ", file=sys.stderr, flush=True)
         self.played.update(fault.name for fault in played)
-        stage.run(self._draw.uniform(0.0, 1.0))
         stage.forget()
         return not lost
 
@@ -221,11 +240,18 @@ def _thirds(values: FloatArray) -> list[int]:
 
 
 def rows(args: argparse.Namespace) -> Iterator[scene.Row]:
-    """One row; the exit status says what is wrong with it."""
+    """One row."""
     logging.getLogger("drivelink").setLevel(logging.CRITICAL)
     sys.setswitchinterval(0.0005)  # the bookkeeping here must not hold the daemon's thread up for long
-    result = Soak(args).run()
-    yield result
+    soak = Soak(args)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, soak.stop)
+    yield soak.run()
+
+
+def verdict(kept: list[scene.Row]) -> str:
+    """Exit with what is wrong with the row; nothing: all is well."""
+    (result,) = kept
     memory, objects = result["rss_kb"], result["objects"]
     flat = memory[1] < memory[0] + FLAT_KB and objects[1] < objects[0] + FLAT_OBJECTS
     if result["wrong_episodes"]:
@@ -234,6 +260,7 @@ def rows(args: argparse.Namespace) -> Iterator[scene.Row]:
         sys.exit(f"{result['slowest_recovery_of']}: {result['slowest_recovery_s']} s until all was well")
     if not flat or len(result["threads"]) != 1:
         sys.exit("memory or threads are not flat")
+    return ""
 
 
 COLUMNS = {
@@ -261,4 +288,5 @@ if __name__ == "__main__":
         scene.Option("--lockstep", False),
         scene.Option("--two", 0.3, "share of faults beside which another begins"),
         scene.Option("--recount", 0.0, "share of reboots after which counts differ"),
+        after=verdict,
     )

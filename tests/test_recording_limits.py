@@ -406,6 +406,16 @@ def test_a_file_with_too_many_frames_is_refused_where_it_has_them(tmp_path):
         read(path, JOINT)
 
 
+@pytest.mark.parametrize("topic", ["sample", "estimate"])
+def test_a_megabyte_has_fewer_samples_and_estimates_than_frames(topic, tmp_path):
+    """Each costs as much as two frames; of a joint at rest they have 8 bytes at least, compressed as can be."""
+    path = mcap_of(tmp_path / "r.mcap", [(topic, 0, b'{"sequence":0,"status":3}')] * 140_000)
+    data = path.read_bytes()
+    path.write_bytes(data[:8] + struct.pack("<BQ", 0x80, 900_000) + bytes(900_000) + data[8:])
+    with one_line("one record for each"):
+        list(read_messages(path))
+
+
 @pytest.mark.parametrize(
     ("can_id", "read_of_it", "said"),
     [

@@ -101,9 +101,10 @@ class MapFollower:
         """
         self._syncs += 1
         found = self._check.sync() if self._check is not None else ()
-        for node in [node for node, before in self._due.items() if before < self._syncs]:
-            del self._due[node]
-            self._use(node)
+        if self._due:
+            for node in [node for node, before in self._due.items() if before < self._syncs]:
+                del self._due[node]
+                self._use(node)
         return found
 
     def _use(self, node: int) -> None:

@@ -153,8 +153,8 @@ def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
     """Return the sample of a message, bit for bit; null becomes NaN."""
     found = map(message.get, _measured(motors))
     values = tuple([math.nan if value is None else float(value) for value in found])
-    positions, velocities, torques = (values[k * motors : (k + 1) * motors] for k in range(3))
-    return Sample(int(message["sequence"]), positions, velocities, torques, *values[3 * motors :])
+    a, b, c = motors, 2 * motors, 3 * motors
+    return Sample(int(message["sequence"]), values[:a], values[a:b], values[b:c], *values[c:])
 
 
 _INTEGER, _TEXT, _FLAG = {"type": "integer"}, {"type": "string"}, {"type": "boolean"}

@@ -308,7 +308,9 @@ impl Assembler {
             return None;
         }
         let any_timed = self.decoders.iter().any(TpdoDecoder::timed);
-        (any_timed && self.usable() && self.certain()).then(|| self.sample())
+        // One that repeats itself in what is left of the cycle was no late one's successor.
+        let settled = self.certain() && !self.decoders.iter().any(|decoder| decoder.replaced);
+        (any_timed && self.usable() && settled).then(|| self.sample())
     }
 
     /// Whether a further frame in one cycle is the one that belongs to it.

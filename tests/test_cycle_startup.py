@@ -14,7 +14,7 @@ from canopenkit import joint_text
 
 from drivelink._core import LATE
 from drivelink.cycle.startup import BusPort, join_bus
-from drivelink.cycle.syncclock import SyncClock, measure_period
+from drivelink.cycle.syncclock import MEASURED_SYNCS, SyncClock, measure_period
 from drivelink.errors import BusError
 from drivelink.jointfile import parse
 
@@ -168,6 +168,19 @@ def test_jitter_lost_syncs_and_stalls_are_no_other_period(lost):
             if rng.random() >= lost
         ]
         assert measure_period(sorted(stamps)[:64], 0.001)[:2] == (0.001, True)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.97, 1.03])
+@pytest.mark.parametrize("caught_up", [True, False], ids=["the reader stalls", "the master stalls"])
+def test_of_a_start_with_stalls_of_twenty_periods_the_period_is_right(caught_up, factor):
+    for seed in range(60):
+        rng, free, stamps = random.Random(seed), 0.0, []
+        for k in range(MEASURED_SYNCS):
+            stall = 20 * factor * (rng.random() < 0.02)
+            due = k * factor + rng.uniform(0.0, 0.05)
+            free = max(free + 0.01, due + stall) if caught_up else free + stall
+            stamps.append(round((free if caught_up else due + free) * MS))
+        assert measure_period(stamps, 0.001).period_s == pytest.approx(factor * 1e-3, rel=0.003)
 
 
 def test_syncs_that_are_mostly_read_in_bursts_are_no_other_period():

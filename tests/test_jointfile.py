@@ -293,6 +293,10 @@ def test_a_running_daemon_has_a_joint_file_read_by_another_process(tmp_path, mon
         apart.load_apart(path)
     with pytest.raises(JointFileError, match=re.escape(str(alone.value))):
         jointfile.load(path)
+    monkeypatch.setattr(apart, "_MAX_BYTES", 100)
+    path.write_text(ELBOW)
+    with pytest.raises(JointFileError, match=r"elbow\.toml: expected at most .* while a joint is served"):
+        apart.load_apart(path)
     monkeypatch.setattr(apart, "_PATIENCE_S", 1e-3)
     with pytest.raises(JointFileError, match=r"elbow\.toml: expected to be read within 0\.001 s"):
         apart.load_apart(path)

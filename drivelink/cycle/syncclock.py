@@ -13,10 +13,10 @@ from drivelink._core import LATE
 
 FloatArray = NDArray[np.float64]
 
-MEASURED_SYNCS = 64  # enough for a period to 0.2 % at a jitter of half of it, to 0.01 % at a fortieth
+MEASURED_SYNCS = 256  # of 2 % that stall for 20 periods, the median is then not one
 _FEWEST = 8
 _SAME = 0.01  # relative: periods that count as the same; 2 % of inertia torque
-_STEADY = 0.02  # the same: then stalls are no part of the median
+_BURST = 0.2  # of the mean step: shorter ones are of SYNCs that were read in one go
 _CHANCE = (
     1e-3  # that times without a common phase agree so well with the declared period; 2 % off, 64 have none
 )
@@ -37,9 +37,9 @@ class MeasuredPeriod(NamedTuple):
 def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPeriod | None:
     """Return the period of SYNCs from their stamps, robust to jitter, stalls and lost SYNCs.
 
-    The expected one where the median step is as long and steady, or where SYNCs agree with its times. Else
-    the slope of a line through the stamps over their numbers, rounded to a value within three standard
-    deviations.
+    The median of the steps between them, over more and more of them; where they jitter too much for that,
+    the slope of a line through the stamps over their numbers. The expected one where that is within three
+    standard deviations, or SYNCs agree with its times; else rounded to a value within them.
 
     Args:
         stamps_ns: of SYNCs one after the other.
@@ -48,40 +48,52 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
     Returns:
         None for fewer than eight or constant stamps.
     """
-    if len(stamps_ns) < _FEWEST:
+    if len(stamps_ns) < _FEWEST or stamps_ns[-1] <= stamps_ns[0]:
         return None
     stamps = ((np.asarray(stamps_ns, dtype=np.int64) - stamps_ns[0]) * 1e-9).astype(np.float64)
     gaps = np.diff(stamps)
-    period_s = float(np.median(gaps))
+    period_s = float(np.median(gaps[gaps > _BURST * np.mean(gaps)]))
     steps = gaps / expected_s
     on_grid = float(np.median(np.abs(steps - np.rint(steps)))) < _JITTERY
     if on_grid and period_s > 1.5 * expected_s and abs(float(np.quantile(steps, 0.1)) - 1) < 3 * _SAME:
         period_s = expected_s  # most of its SYNCs are lost
-    if period_s <= 0:
-        return None
-    spread = float(np.median(np.abs(gaps - period_s))) / period_s
-    steady = spread < _STEADY and abs(period_s - expected_s) <= _SAME * expected_s
-    # Not the median step: where most were read in bursts, that is short.
-    fast = stamps[-1] < 0.5 * expected_s * gaps.size
-    if steady or (period_s < 1.5 * expected_s and not fast and _agree(stamps / expected_s)):
-        return MeasuredPeriod(expected_s, True, spread <= _JITTERY)
-    if spread > _JITTERY:
+    found, std, steady = _over_periods(stamps, period_s)
+    if not steady:
+        if period_s < 1.5 * expected_s and _agree(stamps / expected_s):
+            return MeasuredPeriod(expected_s, True, False)
         # A step of nearly two periods may be jitter; only larger ones count as lost.
         lost = np.where(gaps > 2.2 * period_s, np.rint(gaps / period_s) - 1, 0)
-        slope, std = slope_of(stamps, np.concatenate(([0.0], np.cumsum(1 + lost))))
-    else:
-        slope, std = period_s, period_s
-        for _ in range(2):  # renumber by the improved period
-            clock = SyncClock(slope)
-            jumps = np.array([clock.jump(stamp_ns) for stamp_ns in stamps_ns])
-            if np.count_nonzero(jumps > 0) >= _FEWEST:
-                slope, std = slope_of(stamps[jumps > 0], np.cumsum(np.maximum(jumps, 0))[jumps > 0])
+        found, std = slope_of(stamps, np.concatenate(([0.0], np.cumsum(1 + lost))))
     tolerance = _SIGMAS * std
-    if abs(slope - expected_s) <= max(_SAME * expected_s, tolerance):
-        return MeasuredPeriod(expected_s, True, spread <= _JITTERY)
-    rounded = (float(f"{slope:.{digits}g}") for digits in range(1, 6))
-    found = next((r for r in rounded if abs(r - slope) <= max(tolerance, 1e-3 * slope)), slope)
-    return MeasuredPeriod(found, False, spread <= _JITTERY)
+    if abs(found - expected_s) <= max(_SAME * expected_s, tolerance):
+        return MeasuredPeriod(expected_s, True, steady)
+    rounded = (float(f"{found:.{digits}g}") for digits in range(1, 6))
+    found = next((r for r in rounded if abs(r - found) <= max(tolerance, 1e-3 * found)), found)
+    return MeasuredPeriod(found, False, steady)
+
+
+def _over_periods(stamps: FloatArray, period_s: float) -> tuple[float, float, bool]:
+    """Return the median step over whole periods, its standard deviation, and whether there is one.
+
+    Differences of stamps further and further apart, each divided by the whole periods in it: over many
+    periods a jitter counts for less, and a stall spoils more of them. The surest median is taken.
+    """
+    best, std, apart = period_s, math.inf, 1
+    while apart <= stamps.size // 2:
+        differences = stamps[apart:] - stamps[:-apart]
+        numbers = np.rint(differences / best)
+        some = numbers > 0
+        differences, numbers = differences[some], numbers[some]
+        off = float(np.median(np.abs(differences / best - numbers))) if numbers.size else 1.0
+        if off > _JITTERY:
+            break
+        each = differences / numbers
+        median = float(np.median(each))
+        spread = float(np.median(np.abs(each - median))) * math.sqrt(apart / each.size)
+        if spread < std:
+            best, std = median, spread
+        apart *= 2
+    return best, std, math.isfinite(std)
 
 
 def _agree(places: FloatArray) -> bool:

@@ -13,6 +13,7 @@ from drivelink.jointfile.schema import JointFile
 
 _PATIENCE_S = 20.0  # a second is usual, most of it for starting the interpreter
 _NICENESS = 10
+_MAX_BYTES = 64 << 10  # without comments, which the cycle awaits for a third of a ms; usual are 10 KiB
 
 
 def load_apart(path: Path) -> JointFile:
@@ -34,6 +35,9 @@ def load_apart(path: Path) -> JointFile:
     if done.returncode:
         lines = done.stderr.decode(errors="replace").splitlines()
         raise JointFileError(lines[-1] if lines else f"{path}: its reader ended with {done.returncode}")
+    if len(done.stdout) > _MAX_BYTES:
+        most = f"at most {_MAX_BYTES >> 10} KiB without comments"
+        raise JointFileError(f"{path}: expected {most}, to be read while a joint is served")
     return from_json(done.stdout.decode(), str(path))
 
 

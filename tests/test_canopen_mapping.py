@@ -310,7 +310,8 @@ class OddAnswers(Slave):
         return answer
 
 
-def test_a_node_that_is_slow_to_be_pre_operational_is_waited_for_and_one_that_never_is_is_named():
+def test_a_node_that_is_slow_to_be_pre_operational_is_waited_for_and_one_that_never_is_is_named(monkeypatch):
+    monkeypatch.setattr("drivelink.canopen.mapping._STATE_S", 0.4)
     slave = SlowState(5, drive_objects(5))
     assert signals(configured(slave)[1]) == [[*POSITION_AND_TORQUE, Signal.STATUSWORD]]
     assert slave.refusals == 0

@@ -298,10 +298,13 @@ def test_a_name_without_daemon_is_said_once_with_the_nearest_one(publisher, endp
     assert caplog.messages == ['no daemon of "elbwo"; did you mean "elbow"?']
 
 
-def test_a_daemon_that_is_there_is_listed_and_not_missed(publisher, endpoint, hasty, caplog, capsys):
+def test_a_daemon_that_is_there_is_listed_and_not_missed(
+    publisher, endpoint, hasty, caplog, capsys, monkeypatch
+):
     with drivelink.subscribe("elbow", endpoint=endpoint) as joint:
         joint.wait(timeout_s=0.5)
     assert not caplog.messages
     assert cli.main(["list", "--endpoint", endpoint]) == 0 and capsys.readouterr().out == "elbow\n"
+    monkeypatch.setattr("drivelink.pubsub.session._MEETING_S", 0.3)
     assert cli.main(["list", "--endpoint", free_endpoint()]) == 1
     assert "drivelink run JOINT starts a daemon" in capsys.readouterr().err

@@ -4,6 +4,7 @@ import gc
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # many processes would each compile every library
@@ -13,6 +14,7 @@ import hypothesis
 import pytest
 import zenohkit
 
+from drivelink.cycle import realtime
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
@@ -22,6 +24,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The receivers of a virtual bus share a message, into which nobody writes: half the cost of a frame.
 can.interfaces.virtual.deepcopy = lambda message: message
+
+# A daemon or a simulation in a process of all tests looks through all they keep for garbage, twice, and reads in
+# what is mapped and never used: seconds.
+realtime.gc = SimpleNamespace(collect=int, freeze=int, unfreeze=int, disable=gc.disable, enable=gc.enable)
+realtime._MCL_FUTURE = 4  # MCL_ONFAULT
 
 # How long an example takes says something of the machine only.
 hypothesis.settings.register_profile(

@@ -16,7 +16,7 @@ from sim.canopen.drive import Cia402Drive
 from sim.sensors import DriveSignals
 
 SYNC = 0x080
-LEARNING = 8000  # cycles: the test begins after three seconds of blocks with motion
+LEARNING = 5000  # cycles: the test begins after three seconds of blocks with motion
 
 
 def joint(**changes: object) -> JointFile:

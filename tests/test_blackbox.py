@@ -27,6 +27,7 @@ from drivelink.cli import blackbox as process_of_a_box
 from drivelink.loop import blackbox
 from drivelink.loop.blackbox import AFTER_S, BlackBox
 from drivelink.loop.finding import drop_oldest, event_of, kept
+from drivelink.loop.queue import next_due
 from drivelink.pubsub.feed import DECODERS
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.mapping import joint_of
@@ -271,3 +272,24 @@ def test_lines_of_the_black_box_carry_the_time_of_day_as_the_daemons_do(monkeypa
     assert process_of_a_box.main() == 2
     said = r"\d\d:\d\d:\d\d E nowhere.toml: no black box: .*No such file or directory\n"
     assert re.fullmatch(said, capsys.readouterr().err)
+
+
+def test_what_others_put_into_the_folder_stops_no_box_and_is_not_written_through(tmp_path, caplog):
+    """Names of no time, folders in the places of files, links, pipes; and a status of anybody's."""
+    (folder := tmp_path / "kept").mkdir()
+    (victim := tmp_path / "victim").write_text("untouched")
+    (folder / "elbow-20261399T000000Z-asked.mcap").touch()
+    (folder / "elbow-20260101T000000Z-asked.mcap").mkdir()
+    (folder / "elbow-20260101T000000Z-asked.part").mkdir()
+    (folder / "elbow.day.csv").symlink_to(victim)
+    scene = Scene(tmp_path)
+    assert next_due(folder, "elbow") is None
+    (folder / "elbow.keep").symlink_to(victim)
+    scene.box.document("status", b'{"friction": [{}]}', 0)
+    scene.run(20)
+    (folder / "elbow.day.csv").unlink()
+    os.mkfifo(folder / "elbow.day.csv")  # which nobody reads
+    scene.run(200)
+    ((made, cause),) = scene.finish()
+    assert cause == "asked" and made.stat().st_size > 1000
+    assert victim.read_text() == "untouched" and "rows of the day are not kept" in caplog.text

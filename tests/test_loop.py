@@ -266,7 +266,19 @@ def test_accepting_writes_the_file_keeps_the_old_one_and_can_be_undone(friction,
     assert path.read_text() == edited
 
 
-@pytest.mark.parametrize("damage", [{}, {"state": 1}, {"state": "proposed"}, {"state": "", "sentence": []}])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {},
+        {"state": 1},
+        {"state": "proposed"},
+        {"state": "", "sentence": []},
+        *(
+            {"state": "proposed", "sentence": "it lacks something", **more}
+            for more in ({"error": [1]}, {"report": "x"}, {"report": {"advice": 7}}, {"parameters": 1.5})
+        ),
+    ],
+)
 def test_a_damaged_finding_is_none(damage, tmp_path):
     (tmp_path / "elbow.toml").write_text(ELBOW.read_text())
     (tmp_path / "kept").mkdir()

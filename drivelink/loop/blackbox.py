@@ -16,7 +16,16 @@ from typing import Any, NamedTuple
 from drivelink.errors import JointFileError, RecordingError
 from drivelink.jointfile import JointText, load_text
 from drivelink.loop.day import Day
-from drivelink.loop.finding import DOUBTS, UNFINISHED, drop_oldest, kept, recording_name, taken, wish_of
+from drivelink.loop.finding import (
+    DOUBTS,
+    UNFINISHED,
+    drop_oldest,
+    kept,
+    open_own,
+    recording_name,
+    taken,
+    wish_of,
+)
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.sinks import McapSink, Sink
 from estimator.sample import Sample, Status
@@ -259,7 +268,8 @@ class BlackBox(Sink):
         if "asked" not in event.causes:
             return
         try:
-            with taken(self._wish).open("r+b") as file:
+            with open(taken(self._wish), "r+b", opener=open_own) as file:
                 file.write(text.encode())
         except OSError:  # the file is gone, or there is no room even for that
-            taken(self._wish).unlink(missing_ok=True)
+            with suppress(OSError):
+                taken(self._wish).unlink(missing_ok=True)

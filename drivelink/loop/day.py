@@ -15,7 +15,7 @@ import numpy as np
 from drivelink.errors import RecordingError
 from drivelink.files import read_regular
 from drivelink.loop import finding
-from drivelink.loop.finding import event_of, finding_file, kept, page_file
+from drivelink.loop.finding import event_of, finding_file, kept, open_own, page_file
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import FloatArray, Status
 
@@ -59,8 +59,9 @@ class Day:
         found = document.get("friction")
         known = [one for one in found if isinstance(one, Mapping)] if isinstance(found, list) else []
         if known and len(known) == len(found or ()):
-            torque = sum(one["torque_nm"] for one in known)
-            self._friction = torque, math.hypot(*(one["std_nm"] for one in known))
+            with suppress(KeyError, TypeError):  # anybody may say that he is the daemon
+                torque = sum(one["torque_nm"] for one in known)
+                self._friction = torque, math.hypot(*(one["std_nm"] for one in known))
 
     def row(self) -> None:
         """Write the second that ends now, if there was an estimate; what goes wrong is one line."""
@@ -85,7 +86,7 @@ class Day:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         if self._path.exists() and self._path.stat().st_size >= _MOST // 2:
             self._path.replace(self._before)
-        with self._path.open("a", encoding="ascii") as file:
+        with open(self._path, "a", encoding="ascii", opener=open_own) as file:
             file.write(line if file.tell() else ",".join(COLUMNS) + "\n" + line)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -36,7 +37,16 @@ def kept(folder: Path, joint: str, ending: str = ".mcap") -> list[Path]:
         OSError: the folder cannot be read.
     """
     found = (path for path in folder.iterdir() if path.suffix == ending and path.name.startswith(joint))
-    return sorted(path for path in found if _NAME.fullmatch(path.name, len(joint)))
+    own = (path for path in found if _time_of(_NAME.fullmatch(path.name, len(joint))) is not None)
+    return sorted(path for path in own if path.is_file())
+
+
+def _time_of(match: re.Match[str] | None) -> datetime | None:
+    """Return the time in a name; None: it is no time, or none of ours."""
+    try:
+        return None if match is None else datetime.strptime(match[1], _STAMP).replace(tzinfo=UTC)
+    except ValueError:
+        return None
 
 
 class Event(NamedTuple):
@@ -54,9 +64,9 @@ def event_of(recording: Path) -> Event:
         RecordingError: it is no recording of a black box.
     """
     match = _NAME.search(recording.name)
-    if match is None:
+    time = _time_of(match)
+    if match is None or time is None:
         raise RecordingError(f"{recording}: expected a recording of a black box, JOINT-TIME-CAUSE.mcap")
-    time = datetime.strptime(match[1], _STAMP).replace(tzinfo=UTC)
     return Event(recording.name[: match.start()], time, match[2].replace("-", " "))
 
 
@@ -170,8 +180,20 @@ def read(recording: Path) -> dict[str, Any] | None:
         found = decode_document(read_regular(finding_file(recording), MAX_BYTES))
     except (OSError, DrivelinkError):
         return None
-    said = (found.get("state"), found.get("sentence"))
-    return found if found.get("schema") == SCHEMA and all(isinstance(one, str) for one in said) else None
+    kinds = {"state": str, "sentence": str, "error": dict, "report": dict, "parameters": list}
+    whole = all(isinstance(found.get(name) or kind(), kind) for name, kind in kinds.items())
+    advice = found["report"].get("advice") if whole and found.get("report") else None
+    said = found.get("state") and found.get("sentence") and isinstance(advice or [], list)
+    return found if found.get("schema") == SCHEMA and whole and said else None
+
+
+def open_own(path: str, flags: int) -> int:
+    """Open a file of the folder for writing, as `opener`: no link that somebody has put there, no pipe.
+
+    Raises:
+        OSError: it is one of them, or cannot be opened.
+    """
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 def newest(folder: Path, joint: str) -> tuple[Path, dict[str, Any]] | None:

@@ -293,3 +293,18 @@ def test_what_others_put_into_the_folder_stops_no_box_and_is_not_written_through
     ((made, cause),) = scene.finish()
     assert cause == "asked" and made.stat().st_size > 1000
     assert victim.read_text() == "untouched" and "rows of the day are not kept" in caplog.text
+
+
+def test_a_box_that_begins_leaves_the_recording_that_another_one_still_writes(tmp_path, monkeypatch):
+    """Of a daemon that was killed, while the next one begins."""
+    first, others, wrote = Scene(tmp_path), [], blackbox.McapSink.mapping
+    first.box.mapping({"joint": "elbow", "nodes": []}, 1)
+    monkeypatch.setattr(
+        blackbox.McapSink, "mapping", lambda *a: others.append(Scene(tmp_path)) or wrote(*a)
+    )  # begins meanwhile
+    first.run(100)
+    first.run(200, Status.MODEL_ALARM)
+    assert len(first.finish()) == len(others) == 1
+    (left := tmp_path / "kept" / "elbow-20260105T081500Z-asked.part").touch()
+    Scene(tmp_path)
+    assert not left.exists()

@@ -266,6 +266,19 @@ def test_accepting_writes_the_file_keeps_the_old_one_and_can_be_undone(friction,
     assert path.read_text() == edited
 
 
+def test_what_was_accepted_and_undone_is_so_even_where_the_disk_has_no_room_for_the_finding(
+    friction, tmp_path, monkeypatch
+):
+    path = copied(friction, tmp_path)
+    offer = acceptance.proposal(path)
+    full = RecordingError("no space left on device")
+    monkeypatch.setattr(finding, "write", lambda *_: (_ for _ in ()).throw(full))
+    acceptance.accept(offer)
+    assert path.read_text() != ELBOW.read_text()
+    acceptance.undo(path)
+    assert path.read_text() == ELBOW.read_text()
+
+
 @pytest.mark.parametrize(
     "damage",
     [

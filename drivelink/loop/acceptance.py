@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,7 +94,8 @@ def accept(offer: Proposal) -> Path:
         "recording": offer.recording.name,
     }
     write_model(offer.proposed, path, {"provenance": {"accepted": accepted}}, force=True)
-    finding.write(offer.recording, {**offer.finding, "state": finding.ACCEPTED, "accepted": accepted})
+    with suppress(RecordingError):  # of a full disk: the joint file says it, too
+        finding.write(offer.recording, {**offer.finding, "state": finding.ACCEPTED, "accepted": accepted})
     return old
 
 
@@ -117,7 +119,8 @@ def undo(path: Path) -> Path:
     recording = folder_of(old) / Path(str(accepted.get("recording"))).name
     found = finding.read(recording)
     if found is not None:
-        finding.write(recording, {**found, "state": finding.UNDONE})
+        with suppress(RecordingError):
+            finding.write(recording, {**found, "state": finding.UNDONE})
     return Path(old.name)
 
 

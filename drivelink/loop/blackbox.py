@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import math
+import os
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from drivelink.errors import JointFileError, RecordingError
@@ -93,7 +96,9 @@ class BlackBox(Sink):
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             for left in kept(self._folder, text.joint.name, UNFINISHED):  # by a kill
-                left.unlink()
+                if (lock := _locked(left)) is not None:
+                    left.unlink()
+                    os.close(lock)
             taken(self._wish).unlink(missing_ok=True)
         except OSError as error:
             raise RecordingError(f"{self._folder}: cannot be written: {error.strerror}") from error
@@ -235,10 +240,11 @@ class BlackBox(Sink):
         name, wall = self._text.joint.name, event.wall
         while (path := self._folder / recording_name(name, event.cause, wall)).exists():
             wall += timedelta(seconds=1)  # of a clock that was set back, or begins with each start
-        unfinished = path.with_suffix(UNFINISHED)
+        unfinished, lock = path.with_suffix(UNFINISHED), None
         try:
             sink = McapSink(unfinished, self._text.joint, self._text.text, force=True)
             sink.flush()  # it has its name: what a kill leaves is found at the next start
+            lock = _locked(unfinished)  # which may be that of another daemon, while this one ends
             time_text = event.wall.isoformat(timespec="milliseconds")
             about = {"cause": event.cause, "causes": ", ".join(event.causes), "time": time_text}
             sink.note("black box", {**about, "joint_file": self._text.name})
@@ -260,6 +266,9 @@ class BlackBox(Sink):
                 unfinished.unlink(missing_ok=True)
             self._answer(event, str(error))
             return
+        finally:
+            if lock is not None:
+                os.close(lock)
         _LOG.warning("%s: %s: kept in %s", self._text.joint.name, event.cause, path)
         self._answer(event, path.name)
 
@@ -273,3 +282,14 @@ class BlackBox(Sink):
         except OSError:  # the file is gone, or there is no room even for that
             with suppress(OSError):
                 taken(self._wish).unlink(missing_ok=True)
+
+
+def _locked(path: Path) -> int | None:
+    """Lock a file as long as the returned descriptor is open; None: another process or box has it locked."""
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(fd)
+        return None
+    return fd

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from drivelink import analysis, jointfile
 from drivelink.errors import RecordingError, UsageError
 from drivelink.output.comparison import Comparison, Side
 from drivelink.output.numbers import Units
 from estimator.errors import EstimatorError
-from estimator.freerun import FreeRun, free_run
+from estimator.freerun import FreeRun, free_run, unbroken_s
 from estimator.model import Effect, JointModel
 from estimator.sample import Record
 
@@ -60,9 +58,8 @@ def _shorter(record: Record, model: JointModel) -> str:
     """Return which horizon fits between the gaps; empty where the model itself cannot be simulated."""
     if any(motor.flexible and not motor.transmission.parameters for motor in model.motors):
         return ""
-    runs = np.split(record.sequence, np.flatnonzero(np.diff(record.sequence) != 1) + 1)
-    rows = max(map(len, runs)) // 2  # windows begin at multiples of their length
-    return f"; --horizon {rows * record.period_s:g} fits between its gaps" if rows > 1 else ""
+    fits_s = unbroken_s(record)
+    return f"; --horizon {fits_s:g} fits between its gaps" if fits_s > record.period_s else ""
 
 
 def _side(path: Path, joint: Path | None, names: Sequence[str]) -> Side:

@@ -21,7 +21,7 @@ from estimator.model import Effect, JointModel, Transmission
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import RIGID, TransmissionModel, transmission_model
 
-__all__ = ["Bodies", "FreeRun", "free_run", "nrmse_fit"]
+__all__ = ["Bodies", "FreeRun", "free_run", "nrmse_fit", "unbroken_s"]
 
 _RESOLVED = 0.1
 _SMOOTHED = 21
@@ -75,7 +75,7 @@ def free_run(record: Record, model: JointModel, horizon_s: float | None = None) 
     transmissions.
 
     Args:
-        record: without gaps, or with gaps that are left out: windows with one are not simulated.
+        record: windows begin anew behind each gap.
         model: every flexible transmission has parameters.
         horizon_s: length of a window, s; left out: the longest of 5 s, 2.5 s, 1.25 s, … whose fit is above
             zero in every channel, which a drifting run is not.
@@ -87,8 +87,7 @@ def free_run(record: Record, model: JointModel, horizon_s: float | None = None) 
     if horizon_s is not None:
         return _windows(record, model, horizon_s)
     horizon = 5.0
-    span = float(record.time_s[-1] - record.time_s[0]) if len(record) else 0.0
-    while horizon > max(span, 2 * _SMOOTHED * record.period_s):
+    while horizon > max(unbroken_s(record), 2 * _SMOOTHED * record.period_s):
         horizon /= 2.0
     while True:
         made = _windows(record, model, horizon)
@@ -98,13 +97,23 @@ def free_run(record: Record, model: JointModel, horizon_s: float | None = None) 
         horizon = shorter
 
 
+def unbroken_s(record: Record) -> float:
+    """Return a window for free runs, s: half of the rows lie in unbroken pieces as long."""
+    sizes = np.sort([end - begin for begin, end in _pieces(record)])
+    lasting = np.cumsum(sizes) >= np.sum(sizes) / 2.0
+    return float(sizes[np.argmax(lasting)]) * record.period_s if len(sizes) else 0.0
+
+
+def _pieces(record: Record) -> list[tuple[int, int]]:
+    """Return first row and end of each piece whose states are smoothed over no gap."""
+    cuts = np.flatnonzero(np.diff(record.sequence) != 1) + 1
+    begins, ends = [0, *(cuts + _SMOOTHED // 2)], [*cuts, len(record)]
+    return [(int(a), int(b)) for a, b in zip(begins, ends, strict=True) if a < b]
+
+
 def _windows(record: Record, model: JointModel, horizon_s: float) -> FreeRun:
     size = max(round(horizon_s / record.period_s), 2)
-    whole = [
-        k
-        for k in range(0, len(record) - size + 1, size)
-        if record.sequence[k + size - 1] - record.sequence[k] == size - 1
-    ]
+    whole = [k for begin, end in _pieces(record) for k in range(begin, end - size + 1, size)]
     if not whole:
         raise EstimatorError(f"expected a run without gaps of {horizon_s:g} s for a free run")
     rows = np.asarray(whole)[None, :] + np.arange(size)[:, None]  # (size, windows)

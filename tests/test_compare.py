@@ -20,7 +20,7 @@ from drivelink import cli, jointfile
 from drivelink.comparison import compare
 from drivelink.demo.simulate import alter, world_from_joint
 from drivelink.errors import DrivelinkError
-from drivelink.output.comparison import fits
+from drivelink.output.comparison import fits, simulated
 from drivelink.output.document import show
 from estimator import Effect, EstimatorError, JointModel, LinkDynamics, Motor, Record, Transmission
 from estimator.filters import smoothed
@@ -173,7 +173,7 @@ def test_a_wrong_model_fits_worse(wrong):
     assert all(worse[name] < right[name] - 1.0 for name in ("motor1_position", "motor1_deflection"))
 
 
-def test_the_horizon_shrinks_until_a_drifting_run_fits_and_windows_with_a_gap_are_left_out():
+def test_the_horizon_shrinks_until_a_drifting_run_fits_and_windows_begin_behind_each_gap():
     truth = run()
     bad = joint(inertia_kg_m2=0.4)
     assert min(free_run(truth, bad, 1.5).fit_percent.values()) < 0.0
@@ -181,6 +181,11 @@ def test_the_horizon_shrinks_until_a_drifting_run_fits_and_windows_with_a_gap_ar
     assert chosen.horizon_s < 1.5 and min(chosen.fit_percent.values()) > 0.0
     gap = np.arange(len(truth)) + 7 * (np.arange(len(truth)) > 750)
     assert len(free_run(replace(truth, sequence=gap), joint(), 0.5).time_s) == 1000
+    lossy = truth.rows(np.arange(len(truth)) % 400 != 399)  # a busy machine: no second is whole
+    assert free_run(lossy, joint()).horizon_s < 0.4
+    made = simulated(lossy, fitted=joint(effects=(FRICTION,)))["fitted"]
+    assert 0.38 < made.horizon_s < 0.4 and len(made.time_s) == 3 * 389
+    assert min(made.fit_percent.values()) > 95.0
 
 
 @pytest.mark.parametrize("rows", [5, 21])

@@ -18,7 +18,7 @@ from drivelink.output.numbers import Units, number, value_and_interval
 from estimator.choices import choice
 from estimator.comparison import Correlation, Curve, correlations, friction_curve, stiffness_curve
 from estimator.errors import EstimatorError
-from estimator.freerun import FreeRun, free_run
+from estimator.freerun import FreeRun, free_run, unbroken_s
 from estimator.model import JointModel
 from estimator.sample import SIGMA_95, Record
 
@@ -195,7 +195,7 @@ def simulated(record: Record, **models: JointModel) -> dict[str, FreeRun]:
     made = {}
     for name, model in models.items():
         with contextlib.suppress(EstimatorError):
-            made[name] = free_run(record, model, choice("horizon"))
+            made[name] = free_run(record, model, min(choice("horizon"), unbroken_s(record)))
     return made
 
 

@@ -127,6 +127,14 @@ def test_a_softer_spring_is_no_effect_and_is_proposed_all_the_same(tmp_path):
 
 
 @pytest.mark.usefixtures("pageless")
+def test_what_rises_at_the_very_end_of_a_recording_leaves_all_of_it_to_be_diagnosed(tmp_path, monkeypatch):
+    made = recorded(tmp_path)
+    monkeypatch.setattr(diagnosing, "since", lambda seconds: (seconds[-3].sequence, seconds[-2].sequence))
+    found = diagnosing.make(made)
+    assert (found["state"], found["since"]) == (finding.NOTHING, None)
+
+
+@pytest.mark.usefixtures("pageless")
 def test_where_nothing_has_changed_nothing_is_proposed(tmp_path):
     made = recorded(tmp_path)
     found = diagnosing.make(made)

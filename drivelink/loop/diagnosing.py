@@ -31,6 +31,7 @@ from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
 from estimator.diagnosis import Diagnosis, Errors, diagnose
 from estimator.errors import EstimatorError
+from estimator.gate import check
 from estimator.harm import Unseen, harm
 from estimator.model_monitor import Second, can_monitor, seconds_of
 from estimator.reasons import percent
@@ -112,6 +113,12 @@ def since(seconds: Sequence[Second]) -> tuple[int, int] | None:
     return (seconds[k - 1].sequence, seconds[k].sequence) if rose and gain > 2.0 * math.log(n) else None
 
 
+def _split(record: Record) -> tuple[Record, Record]:
+    """Return the rows to learn from, and those that are held out."""
+    from_ = int(record.sequence[round(_TRAINED * (len(record) - 1))])
+    return record.rows(record.sequence < from_), record.rows(record.sequence >= from_)
+
+
 def make(recording: Path) -> dict[str, Any]:
     """Diagnose a kept recording, and put the joint file that it proposes beside it.
 
@@ -127,9 +134,16 @@ def make(recording: Path) -> dict[str, Any]:
     record = _read(recording, source)
     model = source.joint.model()
     rose = since(seconds_of(record, model)) if can_monitor(model) else None
-    part = record if rose is None else record.rows(record.sequence > rose[1])
-    held_from = int(part.sequence[round(_TRAINED * (len(part) - 1))])
-    trained, held = part.rows(part.sequence < held_from), part.rows(part.sequence >= held_from)
+    part, (trained, held) = record, _split(record)
+    if rose is not None:
+        later = record.rows(record.sequence > rose[1])
+        try:
+            for one in _split(later):
+                check(one, model)
+            part, (trained, held) = later, _split(later)
+        except EstimatorError:  # too late in the recording to be diagnosed by itself
+            rose = None
+    held_from = int(held.sequence[0])
     outcome = diagnose(trained, model, None, held)
     change = _change(part, source.joint, outcome)
     error, state, harmful = _error(part, source.joint, change, held_from), finding.NOTHING, None

@@ -260,6 +260,18 @@ def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_cha
     assert text.count('class="found"') == 4 and "134 → 2.00 % of the torque" in text
 
 
+def test_what_the_last_recordings_agree_on_is_said_with_the_day_since_which_they_do():
+    found = {
+        "verdict": "effect",
+        "effects": ["coulomb_friction@motor1"],
+        "sentence": "The model lacks Coulomb friction.",
+    }
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) | (found if k >= 9 else {}) for k in range(12)]
+    last = "The last 3 of 12 recordings, since 2026-01-14, agree: The model lacks Coulomb friction."
+    assert sentence(*rows) == last
+    assert sentence(*rows[:10]).startswith("No significant change, but the last recording says: ")
+
+
 CUT = "[...document.querySelectorAll('figure, .table')].filter(e => e.scrollWidth > e.clientWidth).length"
 
 SMALLEST = """Math.min(...[...document.querySelectorAll('.large text')].filter(e => e.getClientRects().length)

@@ -230,8 +230,7 @@ def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: lis
     if state == "unread":
         return f"No recording could be used: {rows[-1]['error']}"
     if state == "finding":
-        last = [row for row in rows if row["status"] == "done"][-1]
-        return f"No significant change, but the last recording says: {last['sentence']}"
+        return _found([row for row in rows if row["status"] == "done"])
     if state == "undecided":
         return "The motion does not reveal the stiffness or what could be missing: record a richer one."
     done = sum(row["status"] == "done" for row in rows)
@@ -239,6 +238,21 @@ def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: lis
     if fewest < LEAST:
         return f"Too few recordings to judge a change: {fewest}, of {LEAST} or more."
     return "Steady."
+
+
+def _found(rows: list[dict[str, Any]]) -> str:
+    """What the last recording says, and since when the ones before it have said the same."""
+    last = rows[-1]
+    agreeing = {}
+    for row in reversed(rows):
+        if row is not last and not set(row["effects"] or ()) & set(last["effects"] or ()):
+            break
+        agreeing[row["recording"], row["time"]] = row["time"]
+    if len(agreeing) < 2:
+        return f"No significant change, but the last recording says: {last['sentence']}"
+    every = len({(row["recording"], row["time"]) for row in rows})
+    since = f"{iso(min(agreeing.values()))}"[:10]
+    return f"The last {len(agreeing)} of {every} recordings, since {since}, agree: {last['sentence']}"
 
 
 def _moved(one: dict[str, Any], change: dict[str, Any]) -> tuple[str, str]:

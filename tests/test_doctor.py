@@ -146,8 +146,8 @@ def test_a_moving_joint_passes_the_gate_of_recordings_and_a_fault_is_named_with_
 
 def test_where_samples_are_lost_what_seems_right_is_no_verdict(monkeypatch):
     monkeypatch.setattr("drivelink.doctor.motion._is_sparse", lambda _: True)
-    (finding,) = live().notices
-    assert finding.severity is Severity.INFO and finding.fix.startswith("this machine is too busy")
+    (finding,) = live().notices  # and no "no problem found"
+    assert finding.severity is Severity.WARNING and finding.fix.startswith("this machine is too busy")
 
 
 def test_too_short_a_look_and_a_joint_at_rest_are_no_judgement():
@@ -164,6 +164,7 @@ def test_too_short_a_look_and_a_joint_at_rest_are_no_judgement():
         judge_record(section, parse(joint_on("still")), record)
     at_rest, busy = section.notices
     assert "move the joint during the check" in at_rest.fix
+    assert busy.severity is Severity.WARNING
     assert "samples are missing" in busy.text and busy.fix.startswith("this machine is too busy")
 
 

@@ -41,7 +41,8 @@ def judge_record(section: Section, joint: JointFile, record: Record | None) -> N
         check(record, model)
         judgement = judge(record, model)
     except EstimatorError as error:
-        section.info(joint.name, f"units and signs cannot be checked: {error}", _advice(record))
+        say = section.warn if _is_sparse(record) else section.info  # a joint at rest is no problem
+        say(joint.name, f"units and signs cannot be checked: {error}", _advice(record))
         return
     section.facts["samples"] = len(record)
     _report_judgement(section, joint, judgement, record)
@@ -81,7 +82,7 @@ def _report_judgement(section: Section, joint: JointFile, judgement: Judgement, 
         left = percent(judgement.left, 1)
         text = f"no unit or sign of positions and torque looks wrong: the torque balance leaves {left}"
         if _is_sparse(record):
-            section.info(joint.name, text, _LOST)
+            section.warn(joint.name, text, _LOST)
         else:
             section.ok(joint.name, text)
 

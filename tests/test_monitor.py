@@ -84,6 +84,17 @@ def test_the_view_says_what_matters_at_80_by_24():
     assert sum(ord(c) > 0x2800 and ord(c) < 0x2900 for c in text) > 100  # the curves
 
 
+def test_without_a_bus_no_node_is_operational_and_what_several_nodes_lack_is_said_once():
+    view = filled()
+    view.status = view.status | {
+        "state": "bus lost",
+        "conditions": [f"node {k}: frames are missing" for k in (1, 2)],
+    }
+    text = "\n".join(lines(view, 120, 40))
+    assert "1 not heard" in text and "operational" not in text
+    assert "nodes 1, 2: frames are missing" in text
+
+
 def test_a_view_without_anything_yet_says_so():
     view = JointView("elbow")
     assert "waiting for the first estimate" in "\n".join(lines(view))

@@ -60,11 +60,11 @@ def test_the_page_shows_numbers_flags_gauge_and_nodes_and_that_the_monitor_has_e
         take(sent[0]);
         const texts = look(['stiffness', 'band', 'state', 'flags', 'gauges', 'nodes']);
         events.onerror();
-        return [texts, look(['state', 'flags', 'link']), measured(2.2e-4, 2.2e-4)];
+        return [texts, look(['state', 'flags', 'link']), [measured(2.2e-4, 2.2e-4), measured(0.1000015, 8.06e-6)]];
         """,
         fed(),
     )
-    assert band == "0.00022"  # the digits of the value that it belongs to
+    assert band == ["0.00022", "0.1000015"]  # the digits that the interval leaves
     assert texts[:4] == ["100.0", "± 2.0", "running · rate 1000 Hz", "valid observable"]
     assert "0.50 × baseline" in texts[4] and "node 1 operational" in texts[5]
     state, flags, link = ended

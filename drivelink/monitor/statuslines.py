@@ -6,7 +6,7 @@ document. Terminal, web page and plain lines use its result.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NamedTuple
@@ -112,8 +112,11 @@ def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> 
         cpu=f"{100 * cpu:.0f} %" if cpu is not None else "",
         load=f"{100 * load:.0f} %" if load is not None else "",
         times=tuple((name, p99) for name, p99 in times if p99 is not None),
-        nodes=tuple(_node(*entry) for entry in islice(_part(status, "nodes").items(), _MOST)),
-        wrong=tuple(wrong),
+        nodes=tuple(
+            _node(*entry, heard=status.get("state") != "bus lost")
+            for entry in islice(_part(status, "nodes").items(), _MOST)
+        ),
+        wrong=_together(wrong),
         not_valid=_text(status.get("not_valid")),
         alarm=alarm.get("active") is True,
         location=_text(alarm.get("location")),
@@ -148,8 +151,23 @@ def _texts(value: Any) -> list[str]:
     return [_text(item) for item in value[:_MOST] if _text(item)] if isinstance(value, list) else []
 
 
-def _node(name: str, node: Any) -> NodeState:
-    """Return one entry of `nodes`."""
+def _together(remarks: Iterable[str]) -> tuple[str, ...]:
+    """Say once what is the same of several nodes."""
+    nodes: dict[str, list[str]] = {}
+    for remark in remarks:
+        node, _, said = remark.partition(": ")
+        whose = node.removeprefix("node ")
+        nodes.setdefault(said if whose.isdecimal() else remark, []).append(whose)
+    return tuple(
+        f"node{'s' * (len(whose) > 1)} {', '.join(whose)}: {said}" if whose[0].isdecimal() else said
+        for said, whose in nodes.items()
+    )
+
+
+def _node(name: str, node: Any, *, heard: bool) -> NodeState:
+    """Return one entry of `nodes`; what was true while the bus was there says nothing without it."""
+    if not heard:
+        return NodeState(_text(name), "not heard", False)
     if not isinstance(node, Mapping):
         return NodeState(_text(name), _text(node), False)
     state, fault = _text(node.get("state")), bool(node.get("fault"))

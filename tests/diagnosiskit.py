@@ -12,6 +12,7 @@ from estimator.sample import FloatArray, Record
 
 PERIOD_S = 1e-3
 SECONDS = 10.0
+DRY = {"coulomb_nm", "stribeck_nm", "fading_nm", "link_nm"}  # steep where the motion turns back
 PUSHES_S = (2.3, 4.1, 7.7, 9.2, 13.4)
 INERTIA, DAMPING, STIFFNESS = 0.12, 0.7, 140.0
 LINK_INERTIA, LINK_DAMPING, GRAVITY = 0.35, 0.12, 4.0
@@ -39,7 +40,7 @@ class World:
             return 170.0 * (reference[k] - x[:, :1]) + 6.0 * (rate[k] - x[:, 1:2])
 
         plants = self._plants(m)
-        substeps = 1 if plants.more is None else 2
+        substeps = 2 if DRY & {name for one in self.effects for name in one} else 1
         size = (n, m, 1)
         truth = joints.simulate(plants, controller, PERIOD_S, substeps, size=size, method=joints.HEUN)
         rows = np.stack([truth.theta[..., 0], truth.tau[..., 0], truth.q], axis=1)

@@ -174,7 +174,7 @@ def test_a_bus_that_may_not_be_touched_is_judged_by_its_frames():
     with daemonkit.rig(parse(text)) as made:
         layouts = list(made.daemon.layouts.values())
         with can.Bus(interface="virtual", channel=made.joint.bus.channel) as spy:
-            for _ in range(9):
+            for _ in range(5):
                 made.run(500)
                 while (message := spy.recv(0.0)) is not None:
                     frames.append(message)
@@ -192,7 +192,7 @@ def test_a_bus_that_may_not_be_touched_is_judged_by_its_frames():
             message.timestamp = 1e9 + 1e-3 * syncs
             heard.feed(message)
         record = record_of(heard.readings(), 2, True)
-        assert len(record) > 4000
+        assert len(record) > 2000
         judge_record(section, heard.joint, record)
         (finding,) = section.notices
         assert finding.severity is (Severity.ERROR if direction < 0 else Severity.OK), finding

@@ -39,7 +39,7 @@ from estimator.sample import Sample
 from sim.world import record
 
 ELBOW = Path(__file__).parent.parent / "examples" / "elbow.toml"
-BEFORE_S, AFTER_S = 5, 7
+BEFORE_S, AFTER_S = 4, 5
 NAME = "demo-elbow-20260105T081500Z-model-alarm.mcap"
 STAMP_NS = 1_767_600_000_000_000_000
 
@@ -53,6 +53,7 @@ def recorded(folder: Path, effects: tuple[str, ...] = (), name: str = NAME, **pa
     source = jointfile.load_text(path)
     world = world_from_joint(source.joint)
     columns = [record(world, BEFORE_S)]
+    world.advance()
     alter(world, effects, parameters)
     columns.append(record(world, AFTER_S))
     joined = {key: np.concatenate([part[key] for part in columns]) for key in columns[0]}

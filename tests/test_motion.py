@@ -79,16 +79,16 @@ def test_what_the_likeliest_rival_explains_is_no_noise_of_the_motion_to_come(tmp
     joint, run = written(tmp_path, poor, effect="coulomb_friction=0.5")
     model, record = jointfile.load(joint).model(), recording.read(run)
     outcome = replace(diagnose(record, model), effects=())  # named or not: the recording is the same
-    rivals = motion._Rivals(Problem([record], model, outcome.bandwidth_hz), outcome, 8.0, limits())
+    rivals = motion._Rivals(Problem([record], model, outcome.bandwidth_hz), outcome, 4.0, limits())
     assert rivals.models[0].motors[0].effects[-1].name == "coulomb_friction"
     assert np.std(rivals.noise[2]) < 0.1 * 0.5
 
 
 def test_a_motion_too_short_for_a_ripple_does_not_tell_it(tmp_path):
-    joint, run = written(tmp_path, '{ kind = "rich" }', effect="cogging=0.3")
+    joint, run = written(tmp_path, '{ kind = "rich" }', seconds=5.0, effect="cogging=0.3")
     model, record = jointfile.load(joint).model(), recording.read(run)
     outcome = diagnose(record, model)
-    rivals = motion._Rivals(Problem([record], model, outcome.bandwidth_hz), outcome, 8.0, limits())
+    rivals = motion._Rivals(Problem([record], model, outcome.bandwidth_hz), outcome, 4.0, limits())
     numbers = np.random.default_rng(0).uniform(-1.0, 1.0, (1, Shape.size(1)))
     k = next(
         k
@@ -98,7 +98,7 @@ def test_a_motion_too_short_for_a_ripple_does_not_tell_it(tmp_path):
     (period,) = (t.values["periods_per_rev"] for t in rivals.fitted[k].terms)
     told = []
     for share in (1.5, 4.0):  # periods of the ripple within the motion
-        path = Shape(numbers, 8.0, limits()).path(rivals.period_s)
+        path = Shape(numbers, 4.0, limits()).path(rivals.period_s)
         path = path.scaled(share * 2.0 * np.pi / period / np.ptp(path.position))
         told.append(rivals.least(k, rivals.read(driven(path, rivals.models[k])[0])))
     assert told[0] == 0.0 < told[1]

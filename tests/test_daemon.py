@@ -182,6 +182,17 @@ def test_accepting_a_model_and_undoing_it_lose_no_cycle(reloadable, tmp_path, mo
     assert IN_USE in made.events
 
 
+def test_a_reload_for_which_the_system_has_no_thread_is_made_when_it_has(reloadable, tmp_path, monkeypatch):
+    monkeypatch.setattr(reload, "_EVERY_S", 0.0)
+    (reloader,) = reloadable.daemon._reloaders
+    rewrite(tmp_path / "elbow.toml", "= 0.5,", "= 0.51,")
+    with pytest.MonkeyPatch.context() as full, pytest.raises(RuntimeError, match="no more"):
+        full.setattr(threading.Thread, "start", lambda _: (_ for _ in ()).throw(RuntimeError("no more")))
+        reloader.check()
+    reloader.check()
+    until(lambda: reloader._ready is not None)
+
+
 def test_the_new_model_comes_into_use_even_where_its_thread_gets_no_time(reloadable, tmp_path, monkeypatch):
     monkeypatch.setattr(reload, "_PATIENCE", 50)
     monkeypatch.setattr(reload, "_PAUSE_S", 60.0)  # five steps, and never another one

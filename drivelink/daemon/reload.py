@@ -3,9 +3,8 @@
 When the joint file is rewritten, or on SIGHUP of a service manager, another process reads and validates it. A
 thread builds the new estimator and steps it through the last samples, so that it starts where the old one is;
 it holds neither the interpreter's lock nor one of the cycle's meanwhile. It is swapped in between two cycles.
-If the thread
-cannot catch up with the cycle, the cycle does the rest with more steps per slack than there are new samples,
-so the exchange always completes.
+If the thread cannot catch up with the cycle, the cycle does the rest with more steps per slack than there are
+new samples, so the exchange always completes.
 """
 
 from __future__ import annotations
@@ -84,7 +83,11 @@ class Reloader:
         self._seen, self._requested, self._slacks = signature, False, 0
         self._next_s = time.monotonic() + _EVERY_S
         self._thread = threading.Thread(target=self._prepare, name="reload", daemon=True)
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError:  # the system has no more threads: in a second again
+            self._thread, self._requested = None, True
+            raise
 
     def step(self, _now_ns: int) -> None:
         """Swap in the new estimator when it is ready, in the slack between two cycles."""

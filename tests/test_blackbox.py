@@ -24,9 +24,10 @@ from test_recording_recorder import joint_file
 
 from drivelink import cli, jointfile
 from drivelink.cli import blackbox as process_of_a_box
+from drivelink.cli import keep
 from drivelink.loop import blackbox
 from drivelink.loop.blackbox import AFTER_S, BlackBox
-from drivelink.loop.finding import drop_oldest, event_of, kept
+from drivelink.loop.finding import drop_oldest, event_of, kept, taken, wish_of
 from drivelink.loop.queue import next_due
 from drivelink.pubsub.feed import DECODERS
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
@@ -213,6 +214,11 @@ def test_keep_without_a_black_box_says_what_it_expects(tmp_path, capsys):
         assert "recording.folder: expected the folder of the black box" in capsys.readouterr().err
     path.write_text(path.read_text() + '[recording]\nfolder = "kept"\n')
     assert cli.main(["keep", str(path)]) == 3
+    (tmp_path / "kept").mkdir()
+    os.mkfifo(wish := wish_of(jointfile.load_text(path)))  # which nobody reads
+    assert cli.main(["keep", str(path)]) == 3
+    taken(wish).write_bytes(b"\xff.mcap")
+    assert keep._answer(wish) == "\ufffd.mcap"
     assert "no black box writes there: expected a daemon that was started since" in capsys.readouterr().err
 
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from drivelink import jointfile
 from drivelink.errors import RecordingError
+from drivelink.files import read_regular
 from drivelink.loop.blackbox import AFTER_S
-from drivelink.loop.finding import taken, wish_of
+from drivelink.loop.finding import open_own, taken, wish_of
 
 EPILOG = """\
 The daemon of a joint file with a folder in [recording] keeps the last minute in memory. On an alarm, a
@@ -39,7 +40,8 @@ def run(args: argparse.Namespace) -> int:
     wish = wish_of(jointfile.load_text(args.joint))
     folder = wish.parent
     try:
-        wish.write_bytes(b" " * _ROOM)
+        with open(wish, "wb", opener=open_own) as file:
+            file.write(b" " * _ROOM)
         if not _until(lambda: not wish.exists(), _ANSWER_S):
             raise RecordingError(f"{folder}: no black box answers: expected a running daemon")
     except FileNotFoundError as error:
@@ -77,6 +79,6 @@ def _until(condition: Callable[[], bool], limit_s: float) -> bool:
 def _answer(wish: Path) -> str | None:
     """Return the black box's answer to a wish; empty: not yet; None: it ended, or had no room."""
     try:
-        return taken(wish).read_text().strip()
-    except FileNotFoundError:
+        return read_regular(taken(wish), 16 * _ROOM).decode(errors="replace").strip()
+    except OSError:
         return None

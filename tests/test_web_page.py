@@ -29,7 +29,7 @@ SPAN = """
 """
 
 
-def fed(seconds=4.0, wild=None):
+def fed(seconds=4.0, wild=None, document=STATUS):
     """A joint whose torque is a sine of 2 N·m; one torque of it may be wild."""
     view = JointView("elbow")
     for k in range(int(1000 * seconds)):
@@ -38,7 +38,7 @@ def fed(seconds=4.0, wild=None):
         one = TransmissionEstimate(torque, 100.0, 1.0, phi)
         status = int(Status.VALID | Status.OBSERVABLE)
         view.update(Estimate(k, status, torque, 100.0, 1.0, (one,)), 1e-3 * k)
-    view.status = STATUS
+    view.status = document
     return view
 
 
@@ -83,6 +83,24 @@ def test_undo_stays_on_the_page_when_a_newer_finding_has_come():
         return [hidden("proposed", false), hidden("accepted", true), hidden("diagnosing", true)];
         """
     ) == [True, False, False]
+
+
+def test_without_a_baseline_no_empty_card_stands_below_what_says_so():
+    bare = fed(document={name: value for name, value in STATUS.items() if name != "residual_alarm"})
+    look = "take(sent[0]); return [$('residualsection').hidden, shown('gauges')];"
+    assert page(look, fed())[0] is False
+    hidden, said = page(look, bare)
+    assert hidden is True, said
+
+
+def test_a_finding_that_proposes_nothing_says_so_in_words():
+    about = page(
+        """
+        showFinding({ finding: { state: "nothing", sentence: "", cause: "asked", since: null, recording: "", error: [], details: [] } });
+        return shown("about");
+        """
+    )
+    assert about == "nothing to accept · asked"
 
 
 def test_the_pointer_reads_the_curve_at_its_place():

@@ -16,6 +16,7 @@ from estimator.diagnosis.candidates import sign_smoothing
 from estimator.diagnosis.heldout import Residual, residual_of, wider
 from estimator.effects import elements
 from estimator.model import Effect, JointModel, LinkDynamics, Motor, Transmission
+from estimator.ranges import range_of
 from estimator.sample import Record
 from estimator.transmissions import RIGID
 
@@ -90,7 +91,7 @@ def identify(
         else replace(_fitted(motor, one), effects=_effects(joint, motor.effects, i, notes))
         for i, (motor, one) in enumerate(zip(model.motors, fits, strict=True))
     )
-    link, link_std = _link(joint)
+    link, link_std = _link(joint, notes)
     link_effects = model.link_effects
     if all(one.excited for motor, one in zip(model.motors, fits, strict=True) if motor.flexible):
         link_effects = _effects(joint, link_effects, None, notes)
@@ -162,13 +163,19 @@ def _shared(joint: JointFit, mine: list[int]) -> tuple[float, float] | None:
     return mean, float(np.sum(precision)) ** -0.5
 
 
-def _link(joint: JointFit) -> tuple[LinkDynamics | None, dict[str, float]]:
+def _link(joint: JointFit, notes: list[str]) -> tuple[LinkDynamics | None, dict[str, float]]:
     """The link's dynamics as found, and their standard deviations."""
     link = joint.problem.model.link
     gravity = joint.places(("gravity", None))
     if link is None or not joint.places(("link_inertia", None)):
         return link, {}
     inertia, inertia_std = joint.mean("link_inertia", None)
+    if link.inertia_kg_m2 + inertia < range_of("inertia_kg_m2").least:
+        notes.append(
+            "the link's balance leaves no inertia above 0: its dynamics are kept as declared; "
+            "check sign and unit of the link position"
+        )
+        return link, {}
     damping, damping_std = joint.mean("link_viscous_damping", None)
     std = {"inertia_kg_m2": inertia_std, "viscous_damping_nm_s_rad": damping_std}
     link = replace(

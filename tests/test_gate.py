@@ -24,6 +24,9 @@ from drivelink.jointfile import parse
 from drivelink.recording.corrections import corrections
 from estimator import JointModel, Motor, Record, Transmission
 from estimator.gate import Change, Discrepancy, examine, judge
+from estimator.identify import identify
+from sim.cases import case
+from sim.world import record
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
@@ -198,6 +201,24 @@ def test_fit_reports_what_the_motion_does_not_decide(tmp_path, capsys):
     notes = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))["notes"]
     assert any("does not reveal" in note and "link position" in note for note in notes), notes
     assert "does not reveal" in capsys.readouterr().err
+
+
+def test_a_link_whose_balance_leaves_no_inertia_is_kept_as_declared_with_a_word_of_why():
+    vsa = case("vsa-ii")
+    columns = record(vsa.world(excitation=vsa.rich, seed=1), 5.0)
+    motors = [
+        np.column_stack([columns[f"motor{k}_{what}"] for k in (1, 2)])
+        for what in ("position_rad", "torque_nm")
+    ]
+    run = Record(
+        period_s=1e-3, sequence=np.arange(len(motors[0])), motor_position_rad=motors[0], motor_torque_nm=motors[1],
+        link_position_rad=np.degrees(columns["link_position_rad"]),
+    )  # fmt: skip
+    model = jointfile.load(ROOT / "examples" / "vsa-ii.toml").model()
+    found = identify(run, model)
+    assert found.model.link == model.link and any(
+        "check sign and unit of the link" in note for note in found.notes
+    )
 
 
 DRIVES = """\

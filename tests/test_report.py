@@ -104,6 +104,7 @@ def test_the_report_is_self_contained_and_has_the_verdict_units_bands_the_winner
         ">refitted</text>", "Stiffness of motor 1's transmission, with 95 % bands", "prefers-color-scheme: dark", "currentColor",
     ):  # fmt: skip
         assert part in page, part
+    assert page.index("<h2>Notes") < page.index("error after over before")
     for foreign in ("#ffffff", 'src="http', 'href="http', "@import", "<script"):
         assert foreign not in page
     assert (
@@ -238,6 +239,13 @@ def test_no_curve_over_time_goes_on_where_samples_are_missing(n):
     x, y = axes.lines[0].get_data()
     across = np.flatnonzero(np.isnan(x))
     assert len(across) == 1 and np.isnan(y[across[0]]) and x[across[0] + 1] - x[across[0] - 1] > 2.0
+
+
+def test_a_name_with_a_control_character_is_drawn_without_it(tmp_path):
+    figure, (axes,) = new_figure("\x1b[2Ja name\nof two lines")  # matplotlib warns of what no letter is
+    xy(axes, {"\x1bcurve": PlotCurve(np.arange(3.0), np.arange(3.0))}, "x", "y", "\x9bt")
+    assert b"\x1b" not in save(figure, tmp_path / "x.svg").read_bytes()
+    assert figure.get_suptitle().endswith("a name\nof two lines")
 
 
 def test_what_is_not_finite_or_constant_or_empty_can_be_drawn(tmp_path):

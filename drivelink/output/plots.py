@@ -20,8 +20,10 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from drivelink.files import write_whole
+from drivelink.plaintext import clean_text
 from estimator.sample import SIGMA_95, FloatArray
 
 # Colours of Okabe and Ito (distinguishable with any colour vision), different in lightness for grey prints,
@@ -134,6 +136,10 @@ def svg_text(figure: Figure) -> str:
 def _drawn(figure: Figure, kind: str, *, transparent: bool = False) -> bytes:
     buffer = io.BytesIO()
     metadata = {"Date": None} if kind == "svg" else None  # reproducible files
+    for text in figure.findobj(Text):  # has names of recordings and joints
+        said = text.get_text()
+        if not all(map(str.isprintable, said.split("\n"))):
+            text.set_text("\n".join(clean_text(line, len(line)) for line in said.split("\n")))
     with rc_context(STYLE):
         figure.savefig(buffer, format=kind, metadata=metadata, transparent=transparent)
     return buffer.getvalue()

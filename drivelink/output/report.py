@@ -145,6 +145,7 @@ def sections(outcome: Diagnosis, units: Units) -> list[Section]:
         Section("Parameters", [_parameters(outcome, units)], wide=False),
         Section("Where the candidates stood", _candidates(outcome), wide=False),
         Section("What could not be separated, and what would separate it", _doubts(outcome)),
+        Section("Notes", [Lines(outcome.notes)] if outcome.notes else []),
     ]
     if outcome.series is not None:
         measured = partial(_series_figure, outcome, units, {"measured": "torque_nm"}, "Measured torque")
@@ -317,7 +318,6 @@ def _doubts(outcome: Diagnosis) -> list[Block]:
     lines += [_LIBRARY_NAME.sub(lambda name: in_words(name[0]), line) for line in outcome.advice]
     if outcome.verdict == "insufficient_excitation" or any(f.alternatives for f in outcome.effects):
         lines.append("drivelink diagnose --motion next.csv designs a motion that tells them apart")
-    lines += outcome.notes
     if outcome.effects and not lines:
         lines.append("No other effect explains these data as well.")
     return [Lines(tuple(lines))] if lines else []

@@ -190,7 +190,8 @@ def _figure(joint: dict[str, Any], one: dict[str, Any]) -> str:
         f"Stiffness{several} at a deflection of {one['deflection_rad']:.3g} "
         f"{one['deflection_unit']}, {one['unit']}; scatter "
         f"{100 * one['scatter_relative']:.2g} %, q = {one['q_value']:.2g}. × at the bottom: a recording that "
-        "shows no stiffness. A click opens the diagnosis."
+        "shows no stiffness; hollow: the model was not sufficient; dots below: an effect was found at that "
+        "place. A click opens the diagnosis."
     )
     return f'<figure class="large">{charts}<figcaption>{html.escape(caption)}</figcaption></figure>'
 

@@ -24,7 +24,7 @@ def opened(**keys):
         ({"interface": "slcan", "channel": "/dev/nowhere"}, "slcan /dev/nowhere cannot be opened"),
         ({"interface": "socketcand", "channel": "can0", "options": {"host": 7}}, "expected bus.options = .*host"),
         ({"interface": "udp_multicast", "channel": "no address"}, "udp_multicast no address cannot be opened"),
-        ({"interface": "socketcand", "channel": "can0", "options": {"host": "127.0.0.1", "port": 1}}, "nobody listens there"),
+        ({"interface": "socketcand", "channel": "can0", "options": {"host": "127.0.0.1", "port": 1}}, "nobody listens there .drivelink sim"),
         ({"interface": "socketcan", "channel": "vcan77"}, "ip link add vcan77 type vcan|this kernel has no SocketCAN"),
     ],
 )  # fmt: skip

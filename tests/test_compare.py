@@ -89,7 +89,8 @@ def test_motion_at_constant_velocity_stands_beside_a_free_run_only_where_it_beat
 def test_the_verb_writes_a_page_and_numbers(runs, capsys):
     healthy = str(runs / "healthy.csv")
     assert cli.main(["compare", str(ELBOW), healthy, "--horizon", "1", "--out", str(runs / "page")]) == 0
-    assert "fit of healthy.csv" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "fit of healthy.csv" in out and "A: elbow.toml · B: healthy.csv" in out
     document = json.loads((runs / "page" / "comparison.json").read_text())
     assert document["free_runs"][0]["horizon_s"] == [1.0, 1.0]
     page = (runs / "page" / "comparison.html").read_text()

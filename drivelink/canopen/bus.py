@@ -46,7 +46,7 @@ _REASONS = {
     errno.ENOENT: "there is no such device",
     errno.EAFNOSUPPORT: "this kernel has no SocketCAN (AF_CAN)",
     errno.EPROTONOSUPPORT: "this kernel has no raw CAN sockets",
-    errno.ECONNREFUSED: "nobody listens there",
+    errno.ECONNREFUSED: "nobody listens there (drivelink sim JOINT --interface socketcand does)",
 }
 
 

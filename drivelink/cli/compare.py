@@ -45,11 +45,11 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_target(args.out / "comparison.json", (args.a, args.b), force=True)
     from drivelink.comparison import compare  # takes a second; the arguments are checked
-    from drivelink.output.document import page, write
+    from drivelink.output.document import Paragraph, Section, page, write
 
     made = compare(args.a, args.b, args.joint, names=args.map, horizon_s=args.horizon)
     content, document = made.as_json(), made.document()
-    conclude(args.json, content, document.sections)
+    conclude(args.json, content, [Section("", [Paragraph(made.about)]), *document.sections])
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)
         wrote(args.json, write(args.out, "comparison", content, page(document)))

@@ -63,7 +63,7 @@ class Comparison:
     units: Units
 
     def __repr__(self) -> str:
-        return as_text(self.sections())
+        return as_text([Section("", [Paragraph(self.about)]), *self.sections()])
 
     def residuals(self, side: Side, run: FreeRun) -> tuple[Correlation, Correlation]:
         """Return the correlations of the residual of one free run: that of the first motor's last channel."""
@@ -121,8 +121,12 @@ class Comparison:
 
     def document(self) -> Document:
         """Return the page."""
-        about = " · ".join(f"{letter}: {side.name}" for letter, side in zip("AB", self.sides, strict=True))
-        return Document("A beside B", about, self.sections())
+        return Document("A beside B", self.about, self.sections())
+
+    @property
+    def about(self) -> str:
+        """Which is A, and which B."""
+        return " · ".join(f"{letter}: {side.name}" for letter, side in zip("AB", self.sides, strict=True))
 
     def sections(self) -> list[Section]:
         """Return the page's sections."""

@@ -117,7 +117,7 @@ def _effects(effects: Iterable[Effect], units: Units) -> Rows:
         row
         for effect in effects
         for name, value in effect.parameters.items()
-        for row in parameter_rows(f"{effect.name}.{name}", value, None, units)
+        for row in parameter_rows(f"{effect.name}.{name}", value, effect.std.get(name), units)
     ]
 
 

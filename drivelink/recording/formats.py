@@ -108,7 +108,7 @@ def _layout(header: str, path: Path, wanted: ColumnMap) -> _Layout:
     if not used:
         raise RecordingError(
             f"{path}: expected a header with time_s, motor1_position_rad, motor1_torque_nm, …, "
-            f"got {header[:60]!r} (--map SOURCE=COLUMN[:UNIT] or [recording.columns] names columns of others)"
+            f"got {header[:60]!r} (--map SOURCE=COLUMN[:UNIT] or [recording.columns] says which is which)"
         )
     twice = {name for name in names if name and names.count(name) > 1}
     if twice:

@@ -22,7 +22,7 @@ from drivelink.recording.messages import (
 from drivelink.recording.playback import Played
 from drivelink.recording.sinks import SafeFile
 from estimator.online import Estimator
-from estimator.reasons import why_not_valid
+from estimator.reasons import percent, why_not_valid
 from estimator.sample import SIGMA_95, FloatArray, Status
 
 _STATUS_EVERY_S = 0.25
@@ -181,7 +181,11 @@ class Summary:
 
     def reasons(self) -> list[str]:
         """Return why cycles are not valid, most frequent first: share of the cycles, last sentence."""
-        return [f"{100 * count / self.count:.1f} % of the cycles: {text}" for count, text in self._sorted()]
+        shares = [(count / self.count, text) for count, text in self._sorted()]
+        return [
+            f"{'less than 0.1 %' if share < 0.001 else percent(share, 1)} of the cycles: {text}"
+            for share, text in shares
+        ]
 
     def _sorted(self) -> list[tuple[int, str]]:
         return sorted(self._why.values(), reverse=True)

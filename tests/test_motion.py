@@ -9,6 +9,7 @@ import pytest
 
 from drivelink import cli, jointfile, recording
 from drivelink.demo.simulate import alter, world_from_joint
+from estimator.choices import whole
 from estimator.diagnosis import diagnose, motion
 from estimator.diagnosis.fourier import Limits, Shape
 from estimator.diagnosis.problem import Problem
@@ -108,13 +109,14 @@ def test_a_motion_too_short_for_a_ripple_does_not_tell_it(tmp_path):
 def test_a_designed_motion_is_written_played_and_decides(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(motion, "_POPULATION", 5)
     monkeypatch.setattr(motion, "_GENERATIONS", 1)
+    monkeypatch.setattr(motion, "whole", lambda name: 3 if name == "motion_rivals" else whole(name))
     joint, poor = written(tmp_path, '{ kind = "sines", amplitude_nm = 3.0, frequency_hz = 0.7 }')
     asked = ["diagnose", str(poor), "--joint", str(joint), "--out", str(tmp_path), "--motion"]
-    assert cli.main([*asked, str(tmp_path / "next.csv"), "--motion-seconds", "8"]) == 0
+    assert cli.main([*asked, str(tmp_path / "next.csv"), "--motion-seconds", "4"]) == 0
     assert "What to move next" in capsys.readouterr().out and (tmp_path / "next.png").stat().st_size > 10_000
     table = np.genfromtxt(tmp_path / "next.csv", delimiter=",", names=True)
     most = {"position_rad": 0.6, "velocity_rad_s": 3.0, "acceleration_rad_s2": 30.0, "torque_nm": 12.0}
-    assert len(table) == 8000
+    assert len(table) == 4000
     for name, limit in most.items():
         assert np.max(np.abs(table[f"motor1_{name}"])) <= limit * (1.0 + 1e-6)
     document = json.loads((tmp_path / "report.json").read_text())["motion"]
@@ -126,7 +128,7 @@ def test_a_designed_motion_is_written_played_and_decides(tmp_path, capsys, monke
     )
 
     _, played = written(tmp_path, '{ kind = "motion", file = "next.csv" }', "played.csv")
-    moved = np.genfromtxt(played, delimiter=",", names=True)["motor1_position_rad"][:8000]
+    moved = np.genfromtxt(played, delimiter=",", names=True)["motor1_position_rad"][:4000]
     assert np.std(moved - table["motor1_position_rad"]) < 0.05 * np.std(moved)
     assert cli.main(["diagnose", str(played), "--joint", str(joint), "--out", str(tmp_path), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)

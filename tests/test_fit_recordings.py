@@ -34,7 +34,7 @@ def runs() -> list[Record]:
     made = []
     for seed, zero, friction in zip((5, 6), ZEROS_RAD, FRICTION_NM, strict=True):
         rig = {"late_s": LATE_S, "zero_rad": zero, "coulomb_nm": friction}
-        made += kit.World([rig], seed=seed).run()
+        made += kit.World([rig], seed=seed, seconds=7.0).run()
     return made
 
 

@@ -51,7 +51,7 @@ gravity_nm = {0.98 * kit.GRAVITY}
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("written")
-    worlds = kit.World([{}, {"late_s": LATE_S, "zero_rad": ZERO_RAD}]).run()
+    worlds = kit.World([{}, {"late_s": LATE_S, "zero_rad": ZERO_RAD}], seconds=6.0).run()
     for name, record in zip(("clean", "skewed"), worlds, strict=True):
         joints.write_csv(record, folder / f"{name}.csv")
     pair = gatekit.draw("antagonistic", 1, seconds=6.0, effects=False)

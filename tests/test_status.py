@@ -58,13 +58,29 @@ def test_what_comes_and_goes_is_counted_not_repeated(events, clock, caplog):
     assert caplog.messages[-1] == "the cable is loose (logged once for 500 occurrences)"
 
 
+def test_what_comes_and_goes_for_an_hour_is_a_line_now_and_then_and_after_a_rest_news_again(
+    events, clock, caplog
+):
+    for k in range(3600):
+        clock[0] = float(k)
+        events.begin("flaky", "the cable is loose")
+        events.end("flaky")
+    assert len(caplog.records) < 15
+    for rest in (1300.0, 11.0, 11.0):
+        clock[0] += rest
+        lines = len(caplog.records)
+        events.begin("flaky", "the cable is loose")
+        events.end("flaky")
+        assert len(caplog.records) == lines + 1
+
+
 def test_the_same_with_other_figures_is_the_same(events, clock, caplog):
     for k in range(500):
         clock[0] = 0.1 * k
         events.begin("slow", f"{k} cycles left out so far")
         events.end("slow", f"it keeps up again; {k} were left out")
         events.report(f"the counter jumped, {k} times so far", key="jumped")
-    assert len(caplog.records) == 3 * 5 and len(events.recent()) == 15
+    assert len(caplog.records) == 3 * 3 and len(events.recent()) == 9  # at 0, 10 and 30 s
     assert events.recent()[-1]["text"] == "the counter jumped, 499 times so far"
     assert sum(event["count"] for event in events.recent()) == 1500
 

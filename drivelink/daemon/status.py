@@ -7,22 +7,33 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from drivelink.plaintext import clean_text
+
+
+class _Said(NamedTuple):
+    """What was logged last under a key."""
+
+    event: dict[str, Any]
+    logged_s: float
+    last_s: float  # its last repetition
+    quiet_s: float  # for so long repetitions are counted
+    repeated: int = 0
 
 
 class EventLog:
     """Logs each event once and keeps the last ones for the status document.
 
     A condition has a key and is reported when it begins and when it ends. Repetitions within ten seconds,
-    also with other numbers, are counted instead of logged.
+    also with other numbers, are counted instead of logged; while they go on, each line holds twice as long.
 
     Args:
         clock: UNIX time, s.
     """
 
-    _QUIET_S = 10.0  # for so long repetitions are counted instead of logged
+    _QUIET_S = 10.0  # for so long repetitions are counted instead of logged, at first
+    _LONGEST_S = 600.0  # and after each other line twice as long, up to this
     _KINDS = 4  # different events of one source within that time; further ones count as one
     _LINES = 64  # log lines within that time; further ones are counted
 
@@ -33,7 +44,7 @@ class EventLog:
         self._clock = clock
         self._recent: deque[dict[str, Any]] = deque(maxlen=self._KEPT)
         self._active: dict[str, str] = {}
-        self._said: dict[str, tuple[dict[str, Any], float, int]] = {}  # event, when logged, count since
+        self._said: dict[str, _Said] = {}
         self._sources: dict[str, tuple[float, set[str]]] = {}  # when the first of the keys came, and the keys
         self._window_s, self._lines = -math.inf, 0
 
@@ -99,15 +110,18 @@ class EventLog:
 
     def _note(self, key: str, text: str, level: int) -> None:
         now, text = self._clock(), clean_text(text)
-        event, since, count = self._said.get(key, ({}, -self._QUIET_S, 0))
-        if 0 <= now - since < self._QUIET_S:
-            self._said[key] = (event, since, count + 1)
-            event["text"] = text  # its present numbers
-            event["count"] += 1
+        said = self._said.get(key, _Said({}, -self._QUIET_S, -self._QUIET_S, self._QUIET_S))
+        if 0 <= now - said.logged_s < said.quiet_s:
+            self._said[key] = said._replace(last_s=now, repeated=said.repeated + 1)
+            said.event["text"] = text  # its present numbers
+            said.event["count"] += 1
             return
         if len(self._said) > 256:
             self._said.clear()
         event = {"time": now, "text": text, "count": 1}
-        self._said[key] = (event, now, 0)
-        self._log(level, f"{text} (logged once for {count + 1} occurrences)" if count else text, now)
+        goes_on = 0 <= now - said.last_s < self._QUIET_S
+        quiet_s = min(2.0 * said.quiet_s, self._LONGEST_S) if goes_on else self._QUIET_S
+        self._said[key] = _Said(event, now, now, quiet_s)
+        again = f" (logged once for {said.repeated + 1} occurrences)" if said.repeated else ""
+        self._log(level, text + again, now)
         self._recent.append(event)

@@ -166,6 +166,13 @@ def test_a_printed_table_keeps_every_letter_in_a_narrow_terminal(columns):
     assert first == "".join(names) and max(map(len, lines)) <= columns
 
 
+def test_a_title_stands_whole_above_a_small_table():
+    console = Console(width=80, file=io.StringIO(), record=True)
+    title = "Free run, from measured states every 1 s"
+    show([Section(title, [Grid(("a", "b"), [("1", "2")])])], console)
+    assert console.export_text().splitlines()[0] == title
+
+
 def test_a_baseline_that_cannot_be_measured_is_a_warning(caplog):
     k, still = np.arange(50), np.zeros((50, 1))
     columns = {"motor_position_rad": still, "motor_torque_nm": still, "link_position_rad": 1e-3 * k}

@@ -110,7 +110,9 @@ def show(sections: Iterable[Section], console: Console) -> None:
             if isinstance(block, Paragraph):
                 console.print(Text(_plain(block.text)), soft_wrap=not console.is_terminal)
             elif isinstance(block, Grid):
-                console.print(_printed(block, section.title, console))
+                if title := block.title or section.title:  # a table's own would fold to its width
+                    console.print(Text(spelt(_plain(title), console.encoding), "table.title"))
+                console.print(_printed(block, console))
             elif isinstance(block, Lines):
                 for line in block.lines:
                     console.print(Text(_plain(f"  {line}")), soft_wrap=not console.is_terminal)
@@ -127,12 +129,12 @@ def _plain(text: str) -> str:
     return "\n".join(map(clean_text, text.split("\n")))
 
 
-def _printed(grid: Grid, title: str, console: Console) -> Table:
+def _printed(grid: Grid, console: Console) -> Table:
     encoding = console.encoding
     body = [[_text(row[k]) for row in grid.rows if len(row) > 1] for k in range(len(grid.head))]
     widths = [max(map(len, cells), default=0) for cells in body]
     crowded = sum(max(pair) + 3 for pair in zip(widths, map(len, grid.head), strict=True)) >= console.width
-    table = Table(title=spelt(_plain(grid.title or title), encoding), title_justify="left")
+    table = Table()
     room = sum(widths[1:]) + 3 * len(widths) + _NARROWEST <= console.width
     for k, column in enumerate(grid.head):
         left = k == 0 or column == "unit"

@@ -9,6 +9,8 @@ import numpy as np
 import onlinekit as kit
 import pytest
 
+from estimator import Status
+
 SECONDS = 12.0
 SETTLED = 3000
 
@@ -43,3 +45,12 @@ def test_a_late_link_encoder_is_found_while_cycles_are_lost():
     end = kept > SETTLED + 5000
     assert np.mean(estimates.valid[end]) > 0.95
     assert not np.any(kit.wrong(estimates, motion.stiffness_nm_rad[kept])[end])
+
+
+@pytest.mark.parametrize(("name", "gap"), [("constant", 20), ("quadratic", 22)])
+def test_a_gap_that_a_straight_line_bridges_badly_is_no_change(name, gap):
+    motion = kit.motion(name, SECONDS)
+    left = [sample for k, sample in enumerate(motion.samples) if k < 2 * SETTLED or k % 1000 >= gap]
+    estimates, _ = kit.play(kit.declared(name), left)
+    assert not np.any(estimates.status & int(Status.CHANGED))
+    assert np.mean(estimates.valid[SETTLED:]) > 0.95

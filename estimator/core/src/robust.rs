@@ -295,13 +295,17 @@ impl Robust {
             return self.restart(&inputs);
         }
         let (from, periods) = (self.live.last, f64::from(passed));
+        // A motion at the bandwidth w loses (w n T)²/12 of its amplitude by a straight line.
+        let lost = periods > 2.0 && periods * self.period * self.filters.main.bandwidth > BRIDGED;
+        if lost {
+            self.distrust(); // before the line: none of its rows is learned
+        }
         for k in 1..passed {
             self.advance(&from.towards(&inputs, f64::from(k) / periods));
         }
         self.advance(&inputs);
-        // A motion at the bandwidth w loses (w n T)²/12 of its amplitude by a straight line.
-        if periods > 2.0 && periods * self.period * self.filters.main.bandwidth > BRIDGED {
-            self.distrust();
+        if lost {
+            self.live.unsettled = self.settle;
         }
     }
 

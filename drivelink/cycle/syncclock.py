@@ -39,7 +39,7 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
 
     The median of the steps between them, over more and more of them; where they jitter too much for that,
     the slope of a line through the stamps over their numbers. The expected one where that is within three
-    standard deviations, or SYNCs agree with its times; else rounded to a value within them.
+    standard deviations, or SYNCs agree with its times better than with those found; else rounded to a value within them.
 
     Args:
         stamps_ns: of SYNCs one after the other.
@@ -58,9 +58,10 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
     if on_grid and period_s > 1.5 * expected_s and abs(float(np.quantile(steps, 0.1)) - 1) < 3 * _SAME:
         period_s = expected_s  # most of its SYNCs are lost
     found, std, steady = _over_periods(stamps, period_s)
+    chance = max(-math.log(_CHANCE), _agreement(stamps / found) if steady else 0.0)
+    if period_s < 1.5 * expected_s and _agreement(stamps / expected_s) > chance:
+        return MeasuredPeriod(expected_s, True, steady)
     if not steady:
-        if period_s < 1.5 * expected_s and _agree(stamps / expected_s):
-            return MeasuredPeriod(expected_s, True, False)
         # A step of nearly two periods may be jitter; only larger ones count as lost.
         lost = np.where(gaps > 2.2 * period_s, np.rint(gaps / period_s) - 1, 0)
         found, std = slope_of(stamps, np.concatenate(([0.0], np.cumsum(1 + lost))))
@@ -75,8 +76,9 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
 def _over_periods(stamps: FloatArray, period_s: float) -> tuple[float, float, bool]:
     """Return the median step over whole periods, its standard deviation, and whether there is one.
 
-    Differences of stamps further and further apart, each divided by the whole periods in it: over many
-    periods a jitter counts for less, and a stall spoils more of them. The surest median is taken.
+    Differences of stamps further and further apart, each divided by the whole periods in it, as long as their
+    number is certain. Over many periods a jitter counts for less, and so does that late SYNCs are followed by
+    short steps, of which there are more.
     """
     best, std, apart = period_s, math.inf, 1
     while apart <= stamps.size // 2:
@@ -90,15 +92,14 @@ def _over_periods(stamps: FloatArray, period_s: float) -> tuple[float, float, bo
         each = differences / numbers
         median = float(np.median(each))
         spread = float(np.median(np.abs(each - median))) * math.sqrt(apart / each.size)
-        if spread < std:
-            best, std = median, spread
+        best, std = median, spread
         apart *= 2
     return best, std, math.isfinite(std)
 
 
-def _agree(places: FloatArray) -> bool:
-    """Return whether times, in periods, have a common phase: Rayleigh's test against any phase at all."""
-    return bool(np.abs(np.mean(np.exp(2j * np.pi * places))) ** 2 * places.size > -math.log(_CHANCE))
+def _agreement(places: FloatArray) -> float:
+    """Return how well times, in periods, have a common phase: Rayleigh's statistic."""
+    return float(np.abs(np.mean(np.exp(2j * np.pi * places))) ** 2 * places.size)
 
 
 def slope_of(times_s: FloatArray, numbers: NDArray[Any]) -> tuple[float, float]:

@@ -39,3 +39,6 @@ def test_a_joint_without_a_known_mapping_is_one_line(tmp_path, capsys):
     joint.write_text(TEXT + '[zenoh]\nendpoint = "tcp/127.0.0.1:1"\n')
     assert main(["dbc", str(joint)]) != 0
     assert "expected the mapping of its nodes" in capsys.readouterr().err.splitlines()[-1]
+    (table := tmp_path / "elbow.csv").touch()
+    assert main(["dbc", str(table)]) != 0
+    assert "expected a joint file, or a recording that carries one" in capsys.readouterr().err

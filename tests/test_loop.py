@@ -252,7 +252,13 @@ def test_accepting_writes_the_file_keeps_the_old_one_and_can_be_undone(friction,
     shown = capsys.readouterr().out
     assert '+name = "coulomb_friction"' in shown and "N·m before" in shown and "not accepted" in shown
     assert path.read_text() == ELBOW.read_text()
-    offer = acceptance.proposal(path)
+    later = path.parent / "kept" / NAME.replace("-2", "-3", 1)
+    later.touch()
+    finding.write(
+        later, {"schema": finding.SCHEMA, "state": finding.DIAGNOSING, "sentence": "being looked for"}
+    )
+    offer = acceptance.proposal(path)  # what is still being diagnosed takes its place when it is done
+    later.unlink()
     old = acceptance.accept(offer)
     assert old.read_text() == ELBOW.read_text() and old.name.startswith("elbow-2")
     assert [one.name for one in jointfile.load(path).motor[0].effect][-1] == "coulomb_friction"

@@ -31,7 +31,12 @@ def run(args: argparse.Namespace) -> int:
         source = jointfile.load_text(args.source)
         layouts = known_layouts(source)
     else:
-        source = joint_of(args.source, None)
+        try:
+            source = joint_of(args.source, None)
+        except UsageError as error:
+            raise UsageError(
+                f"{args.source}: expected a joint file, or a recording that carries one"
+            ) from error
         layouts = recorded_layouts(args.source, source.joint.name, daemon=False)
     if not layouts:
         raise UsageError(

@@ -32,5 +32,8 @@ def run(args: argparse.Namespace) -> int:
     elif names:
         print("\n".join(names))
     else:
-        print(f"no joint at {args.config or endpoint}: drivelink run JOINT starts a daemon", file=sys.stderr)
+        of = f" of prefix {args.prefix!r}" if args.prefix else ""
+        print(
+            f"no joint{of} at {args.config or endpoint}: drivelink run JOINT starts a daemon", file=sys.stderr
+        )
     return 0 if names else 1

@@ -39,7 +39,8 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
 
     The median of the steps between them, over more and more of them; where they jitter too much for that,
     the slope of a line through the stamps over their numbers. The expected one where that is within three
-    standard deviations, or SYNCs agree with its times better than with those found; else rounded to a value within them.
+    standard deviations, or SYNCs agree with its times better than with those found; else rounded to a value
+    within them.
 
     Args:
         stamps_ns: of SYNCs one after the other.

@@ -52,7 +52,7 @@ class Proposal(NamedTuple):
 
 
 def proposal(path: Path) -> Proposal:
-    """Return the newest finding of a joint, if a joint file is proposed by it.
+    """Return the newest finding of a joint whose diagnosis is over, if a joint file is proposed by it.
 
     Raises:
         JointFileError: the joint file, or the proposed one, is wrong.
@@ -60,7 +60,7 @@ def proposal(path: Path) -> Proposal:
     """
     source = load_text(path)
     folder, joint = folder_of(source), source.joint.name
-    newest = finding.newest(folder, joint)
+    newest = finding.newest(folder, joint, finished=True) or finding.newest(folder, joint)
     if newest is None:
         raise RecordingError(
             f"{folder}: no finding about {joint} yet: the next alarm or `drivelink keep` makes one"

@@ -196,15 +196,21 @@ def open_own(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
-def newest(folder: Path, joint: str) -> tuple[Path, dict[str, Any]] | None:
-    """Return the newest recording of a joint with a finding, and that; None: there is none."""
+def newest(folder: Path, joint: str, *, finished: bool = False) -> tuple[Path, dict[str, Any]] | None:
+    """Return the newest recording of a joint with a finding, and that; None: there is none.
+
+    Args:
+        folder: of its recordings.
+        joint: its name.
+        finished: only of those whose diagnosis is over.
+    """
     try:
         recordings = kept(folder, joint)
     except OSError:
         return None
     for recording in reversed(recordings):
         found = read(recording)
-        if found is not None:
+        if found is not None and not (finished and found["state"] == DIAGNOSING):
             return recording, found
     return None
 

@@ -52,7 +52,7 @@ def read(
     if read_columns is not None:
         names = column_map(joint, names)
         columns, ignored = read_columns(path, names)
-        ours = renamed(columns, names, str(path))
+        ours = renamed(columns, names, str(path), ignored)
         left = tuple(name for name in ignored if name not in ours)
         return record_from_columns(ours, str(path), joint, keep_nan, left)
     if names:

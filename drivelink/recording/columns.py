@@ -78,8 +78,16 @@ def column_map(joint: JointFile | None, asked: ColumnMap | None) -> ColumnMap:
     } | dict(asked or {})
 
 
-def renamed(columns: Mapping[str, FloatArray], names: ColumnMap, where: str) -> dict[str, FloatArray]:
+def renamed(
+    columns: Mapping[str, FloatArray], names: ColumnMap, where: str, unread: Sequence[str] = ()
+) -> dict[str, FloatArray]:
     """Return the columns under our names in SI units; sources are no longer available by their own names.
+
+    Args:
+        columns: that were read.
+        names: of ours, where they come from.
+        where: the file.
+        unread: names of its other columns.
 
     Raises:
         RecordingError: a source is missing.
@@ -93,7 +101,7 @@ def renamed(columns: Mapping[str, FloatArray], names: ColumnMap, where: str) -> 
         if source.column not in columns:
             by = f"--map {source.column}={name}" if source.asked else f"recording.columns.{name}"
             raise RecordingError(
-                f"{where}: {by}: no such column {source.column!r}, found {', '.join(columns)}"
+                f"{where}: {by}: no such column {source.column!r}, found {', '.join([*columns, *unread])}"
             )
     used = {source.column for source in names.values()}
     kept = {name: values for name, values in columns.items() if name not in used and name not in names}

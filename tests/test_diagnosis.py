@@ -95,6 +95,9 @@ def test_a_small_delay_without_link_dynamics_may_be_another_effects(records):
 def test_two_ripples_of_one_kind_are_both_found(records):
     found = diagnose(records["harmonics"], kit.model())
     assert [effect.name for effect in found.effects] == ["cogging", "cogging"]
+    (curve,), (spring,) = found.stiffness, found.transmissions
+    middle = len(curve.deflection_rad) // 2  # one interval: the band's is the stated one
+    assert curve.after_std_nm_rad[middle] == pytest.approx(spring.std["k_nm_rad"], rel=1e-9)
     periods = sorted(float(effect.parameters["periods_per_rev"]) for effect in found.effects)
     assert periods == pytest.approx([17.0, 34.0], abs=0.1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.problem import Problem
-from estimator.diagnosis.result import StiffnessCurve
+from estimator.diagnosis.result import Refitted, StiffnessCurve
 from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import TransmissionModel
 
@@ -57,9 +58,16 @@ def middle(model: TransmissionModel, alpha: FloatArray, covariance: FloatArray, 
 
 
 def stiffness_curves(
-    problem: Problem, before: Fitted, after: Fitted, surplus: float
+    problem: Problem, before: Fitted, after: Fitted, surplus: float, stated: Sequence[Refitted]
 ) -> tuple[StiffnessCurve, ...]:
-    """Return one curve for each flexible transmission, over the deflections of the first recording."""
+    """Return one curve for each flexible transmission, over the deflections of the first recording.
+
+    Args:
+        problem: the recordings.
+        before: of the declared model. after: with the effects.
+        surplus: see `hac_covariance`.
+        stated: each motor's transmission, whose covariance the refitted band has where there is one.
+    """
     both = [(fitted, hac_covariance(problem, fitted, surplus)) for fitted in (before, after)]
     frame, made = problem.frames[0], []
     for i, motor in enumerate(problem.model.motors):
@@ -67,13 +75,21 @@ def stiffness_curves(
             continue
         reach = float(np.max(np.abs(frame.motors[i].deflection)))
         phi = np.linspace(-reach, reach, 2 * whole("points") + 1)
-        curves = [_stiffness(frame, *one, i, phi) for one in both]
+        curves = [
+            _stiffness(frame, *one, i, phi, rows)
+            for one, rows in zip(both, ((), stated[i].covariance), strict=True)
+        ]
         made.append(StiffnessCurve(i, phi, *curves[0], *curves[1]))
     return tuple(made)
 
 
 def _stiffness(
-    frame: Frame, fitted: Fitted, covariance: FloatArray, motor: int, phi: FloatArray
+    frame: Frame,
+    fitted: Fitted,
+    covariance: FloatArray,
+    motor: int,
+    phi: FloatArray,
+    stated: Sequence[Sequence[float]],
 ) -> tuple[FloatArray, FloatArray]:
     """(stiffness, standard deviation) of one motor's transmission."""
     model = fitted.base.models(frame)[motor]
@@ -82,7 +98,7 @@ def _stiffness(
         return nothing, nothing
     mine = [j for j, slot in enumerate(fitted.slots) if slot.kind == "base" and slot.motor == motor]
     alpha = np.array([fitted.slots[j].taken + fitted.posterior.x[j] for j in mine])
-    own = covariance[np.ix_(mine, mine)]
+    own = np.array(stated) if stated else covariance[np.ix_(mine, mine)]
     slopes = model.stiffness_jacobian(phi, alpha)
     variance = np.einsum("ij,jk,ik->i", slopes, own, slopes)
     return np.asarray(model.stiffness(phi, alpha)), np.sqrt(np.maximum(variance, 0.0))

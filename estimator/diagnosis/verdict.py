@@ -165,7 +165,7 @@ class Judge:
             notes=tuple(dict.fromkeys(notes)),
             surplus=surplus,
             recordings=self._recordings(before, after),
-            stiffness=stiffness_curves(problem, before, after, surplus),
+            stiffness=stiffness_curves(problem, before, after, surplus, transmissions),
         )
 
     def _declared(self, effects: list[Finding]) -> Fitted:

@@ -17,9 +17,7 @@ MEASURED_SYNCS = 256  # of 2 % that stall for 20 periods, the median is then not
 _FEWEST = 8
 _SAME = 0.01  # relative: periods that count as the same; 2 % of inertia torque
 _BURST = 0.2  # of the mean step: shorter ones are of SYNCs that were read in one go
-_CHANCE = (
-    1e-3  # that times without a common phase agree so well with the declared period; 2 % off, 64 have none
-)
+_CHANCE = 1e-3  # that times without a common phase agree so well with the declared period
 _JITTERY = 0.15  # median deviation of the steps, in periods
 _SIGMAS = 3.0
 
@@ -91,9 +89,8 @@ def _over_periods(stamps: FloatArray, period_s: float) -> tuple[float, float, bo
         if off > _JITTERY:
             break
         each = differences / numbers
-        median = float(np.median(each))
-        spread = float(np.median(np.abs(each - median))) * math.sqrt(apart / each.size)
-        best, std = median, spread
+        best = float(np.median(each))
+        std = float(np.median(np.abs(each - best))) * math.sqrt(apart / each.size)
         apart *= 2
     return best, std, math.isfinite(std)
 

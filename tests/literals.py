@@ -98,7 +98,6 @@ NUMERIC = {
     "model_monitor.rs WINDOW_S": "a second, as it is called",
     "noise.rs THIRD": "third differences of white noise have 20 times its variance",
     "paper.rs SIGMA_95": "quantile of the normal distribution",
-    "sample_validator/channels.rs ABRUPT": "between 1/16 of a parabola and 1/4 of a line",
     "sample_validator/channels.rs ROUNDING": "what arithmetic, or a text of ten digits, leaves of counts that cancel",
     "sample_validator/channels.rs SINGLE": "what single precision leaves of them",
     "spring.rs RIDGE": "keeps rounding from deciding between parallel functions",

@@ -40,8 +40,8 @@ pub struct Accepted {
 /// start anew from there. After a gap a place that no velocity seen so far leads to is a jump, too. A torque
 /// may jump, but one that would throw the bare motor about and is many times the largest one seen is left
 /// out unless it persists. A channel is frozen when it repeats itself exactly for longer than it has ever
-/// done in good times, while a position moves; a position only if it stopped dead: a link that comes to
-/// rest while the motors go on, as under a controller, is no fault, nor is a motor that friction stops.
+/// done in good times, while a position moves; a position only if it stopped dead, sooner than friction can: a link
+/// that comes to rest while the motors go on, as under a controller, is no fault, nor is a motor that friction stops.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SampleValidator {
     #[serde(deserialize_with = "crate::sample::motors")]

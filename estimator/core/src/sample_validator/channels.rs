@@ -7,9 +7,6 @@ use crate::choices::{FAR, PATIENCE};
 use crate::sample::MOTORS;
 use crate::suspicion::{Reason, Signal};
 
-/// … or that slowed down: of the way of that time, a motor that friction brings to rest goes 1/16 in the last quarter, a
-/// reading that freezes in motion 1/4.
-const ABRUPT: f64 = 1.0 / 8.0;
 /// Of a position: what arithmetic, or a text of ten digits, leaves of counts that cancel …
 const ROUNDING: f64 = 4e-9;
 const SINGLE: f64 = 2.5e-7; // … and of one in single precision
@@ -27,13 +24,14 @@ impl SampleValidator {
             m.runs = [0; CHANNELS];
             return false;
         };
+        let bend = self.gain / FAR * m.torque; // what the torque makes of a motor's way in a period
         let (mut moving, mut still) = (0.0, None);
         for i in 0..count {
             if values[i] == old[i] {
                 m.runs[i] += 1;
                 let run = m.runs[i];
                 if run == 1 && i < watched {
-                    m.stopped_dead[i] = stops_dead(&self.trail, i, m.steps[i]);
+                    m.stopped_dead[i] = stops_dead(&self.trail, i, m.steps[i], bend);
                 }
                 if m.samples < self.learning {
                     m.usual[i] = m.usual[i].max(run);
@@ -105,12 +103,16 @@ impl SampleValidator {
     }
 }
 
-/// Whether a position that now stands did so out of motion; `count`: its resolution, which rounds its ways.
-fn stops_dead(trail: &VecDeque<[f64; PLACES]>, place: usize, count: f64) -> bool {
+/// Whether a position that now stands did so out of motion: it was never, as far as its resolution `count` tells, half
+/// as fast as on average, and friction stops it later: with a way that bends by at most `bend` a period it goes
+/// n² bend / 2 in the last n.
+fn stops_dead(trail: &VecDeque<[f64; PLACES]>, place: usize, count: f64, bend: f64) -> bool {
     let last = trail.len() - 1;
-    let way = |periods: usize| (trail[last][place] - trail[last - periods][place]).abs();
-    let all = way(last);
-    all > FAR * count && way(last / 4) - count > ABRUPT * all
+    let way = |n: usize| (trail[last][place] - trail[last - n][place]).abs();
+    let half = |n: usize| 0.5 * way(last) * n as f64 / last as f64;
+    way(last) > FAR * count
+        && (1..last).all(|n| half(n) < count || way(n) > half(n))
+        && (1..last).any(|n| way(n) - count > 0.5 * bend * (n * n) as f64)
 }
 
 #[cfg(test)]

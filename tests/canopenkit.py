@@ -102,17 +102,7 @@ def sheet_objects(sheet: DataSheet, node: int) -> Objects:
 
 @dataclass
 class Slave:
-    """One node.
-
-    Attributes:
-        node: node id.
-        objects: its dictionary.
-        refuse: (index, subindex) -> abort code for any write to it.
-        silent: never answers.
-        state: NMT state.
-        writes: accepted writes in order.
-        forgets: drops what is written to a mapping, as a broken drive does.
-    """
+    """One node."""
 
     node: int
     objects: Objects
@@ -126,7 +116,6 @@ class Slave:
     _toggle: int = 0
 
     def handle(self, cob_id: int, data: bytes) -> list[tuple[int, bytes]]:
-        """Frames in, frames out."""
         if self.silent:
             return []
         if cob_id == 0 and data[1] in (0, self.node):
@@ -215,12 +204,7 @@ def _abort(head: bytes, code: int) -> bytes:
 
 
 class Wire:
-    """A bus in memory: what is sent is answered at once, and everything is written down.
-
-    Attributes:
-        sent: frames of the master, in order.
-        log: everything, ">" from the master, "<" to it.
-    """
+    """A bus in memory: what is sent is answered at once, and everything is written down."""
 
     def __init__(self, slaves: Iterable[Slave] = ()) -> None:
         self.slaves = list(slaves)
@@ -277,7 +261,6 @@ def joint_text(drive: str = "", link: str = "", bus: str = "") -> str:
 
 
 def configure(bus, joint, base_dir=Path(), *, idle=None):
-    """The layouts of one joint's nodes, configured."""
     return configure_joints(bus, [joint], [base_dir], idle=idle)[1][0]
 
 
@@ -291,7 +274,6 @@ def configured(slave: Slave, text: str = "", **sections: str) -> tuple[Wire, Nod
 
 
 def signals(layout: NodeLayout) -> list[list[Signal]]:
-    """What each TPDO carries."""
     return [[mapped.signal for mapped in tpdo.objects] for tpdo in layout.tpdos]
 
 

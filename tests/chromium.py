@@ -80,7 +80,6 @@ class Chromium:
         raise TimeoutError(script)
 
     def resize(self, width: int, height: int) -> None:
-        """Another screen, e.g. a phone's."""
         self._call(
             "Emulation.setDeviceMetricsOverride",
             width=width,

@@ -25,7 +25,6 @@ from drivelink.pubsub.wire import decode_estimate, decode_external, decode_sampl
 from sim.faults import Faults  # noqa: E402
 from sim.network import Network  # noqa: E402
 
-SPRING = {"k_nm_rad": 0.5, "c": 1.75}
 QUICK = Settings(identify_s=1.5, way_s=0.8, rest_s=0.2)
 SAFE_WITHIN_S = 0.020
 _channels = itertools.count()
@@ -39,15 +38,7 @@ def declared_text() -> str:
 
 
 class Rig:
-    """A joint in lockstep.
-
-    Attributes:
-        now_s: bus time.
-        sent: (identifier, data) of each frame of the controller.
-        commands: (time, identifier, per mille) of each torque among them.
-        events: (phase, reason, age of the last estimate) of the controller.
-        cut: nothing reaches the controller over zenoh.
-    """
+    """A joint in lockstep."""
 
     def __init__(self, settings: Settings = QUICK, channel: str | None = None, text: str = "") -> None:
         joint = jointfile.parse(text or declared_text())
@@ -88,7 +79,6 @@ class Rig:
             bus.shutdown()
 
     def put(self, tick) -> None:
-        """The daemon publishes."""
         self._estimates.append(decode_estimate(tick.estimate_payload))
         if tick.external_payload is not None:
             self.external = decode_external(tick.external_payload)

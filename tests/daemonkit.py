@@ -116,7 +116,6 @@ class DaemonRig:
         self.daemon.events._recent.clear()
 
     def run(self, cycles: int) -> list[Estimate]:
-        """Run on; the estimates of these cycles."""
         before = len(self.collector.estimates)
         self.daemon.run_lockstep(cycles)
         return [estimate for estimate, _ in self.collector.estimates[before:]]

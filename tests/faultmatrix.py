@@ -66,7 +66,6 @@ class Outcome(NamedTuple):
     suspected: str = ""
 
     def names(self, fault: Fault) -> bool:
-        """Whether the suspected signal is one that the fault hits."""
         return any(self.suspected in SUSPECTS[signal] for signal in fault.signals)
 
 
@@ -113,7 +112,6 @@ def _held(x: Values, size: float, rng: np.random.Generator, periods: int) -> Val
 
 
 def faults() -> Iterator[Fault]:
-    """All of them."""
     for signal in SIGNALS:
         one = (signal,)
         yield Fault(

@@ -34,11 +34,7 @@ _PATIENCE_S = 30.0  # of the stage's own time; every way back takes less
 
 
 class Sink(Collector):
-    """Keeps everything, and with each sample the SYNC that its values must be of.
-
-    Attributes:
-        due: for every sample, number of the last SYNC that its values may be of.
-    """
+    """Keeps everything, and with each sample the SYNC that its values must be of."""
 
     def __init__(self, stage: Stage) -> None:
         super().__init__()
@@ -46,7 +42,6 @@ class Sink(Collector):
         self.due: list[int] = []
 
     def forget(self) -> None:
-        """Start anew."""
         self.estimates, self.samples, self.payloads, self.due = [], [], [], []
 
     def put(self, tick: Tick) -> None:
@@ -120,7 +115,6 @@ class Stage:
     # Time, as each stage has it
 
     def run(self, seconds: float) -> None:
-        """Let time pass."""
         raise NotImplementedError
 
     def schedule(self, seconds: float, action: Callable[[], None]) -> None:
@@ -130,7 +124,6 @@ class Stage:
             self._due.setdefault(cycle, []).append(action)
 
     def act(self) -> None:
-        """Take the actions that are due."""
         if not self._due:
             return
         with self._planning:
@@ -166,7 +159,6 @@ class Stage:
         raise AssertionError(f"not well again: { {key: document[key] for key in told} }")
 
     def forget(self) -> None:
-        """What was published, said and measured until now is of no more interest."""
         self.daemon.events._lines = 0  # as in the usual hours between two faults
         self.daemon.events._said.clear()  # what was said for the fault before must not count as said
         self.collector.forget()
@@ -179,7 +171,6 @@ class Stage:
             self._injector = None
 
     def start(self, fault: Fault) -> None:
-        """Plan what the script has for a fault."""
         for seconds, action, arguments in fault.steps:
             self.schedule(seconds, partial(self.do, action, *arguments))
 
@@ -336,12 +327,10 @@ class Stage:
             vars(node).pop("transmit", None)
 
     def inject(self, cob_id: int, data: bytes) -> None:
-        """A frame from a third party on the same bus."""
         self.injector.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
 
     @property
     def injector(self) -> can.BusABC:
-        """The third party."""
         if self._injector is None:
             section = self.joint.bus
             self._injector = can.Bus(interface=section.interface, channel=section.channel)

@@ -9,13 +9,7 @@ from sim.world import World
 
 
 class Truth:
-    """What the devices of a world measured at every SYNC, in counts, and a check of samples against it.
-
-    Attributes:
-        torque_rms_nm: rms of the flexibility torque until now.
-        unseen: whether the devices did not see the last SYNC.
-        synced: whether they see one just now: it moves the world on, and then they sample.
-    """
+    """What the devices of a world measured at every SYNC, in counts, and a check of samples against it."""
 
     def __init__(self, world: World, daemon: Daemon) -> None:
         self._world = world

@@ -59,7 +59,6 @@ def write_mcap(record: Record, name: str, path: Path, begin_s: int) -> Path:
 
 
 def row(digest: str = "a", joint: str | None = "elbow", **more: Any) -> dict[str, Any]:
-    """A row of a table."""
     return {
         "id": f"{digest}-{joint}", "joint": joint, "digest": digest, "recording": f"{digest}.csv", "size_bytes": 1,
         "stamp": "s", "status": "done", "version": "1", "accepted_model": "m", "transmission": 1,

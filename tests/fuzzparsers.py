@@ -85,7 +85,6 @@ def write_recording(path: Path) -> Path:
 
 
 def read_every_way(path: Path) -> None:
-    """Everything that reads a recording."""
     for work in (
         lambda: read(path, JOINT),
         lambda: sum(1 for _ in open_playback(path, JOINT, path.parent)),
@@ -130,7 +129,6 @@ PARSERS = tuple(_TAKE)
 
 @cache
 def seeds(parser: str) -> tuple[bytes, ...]:
-    """Good inputs of a parser."""
     if parser in RECORDINGS:
         with TemporaryDirectory() as folder:
             return (write_recording(Path(folder, f"r{parser}")).read_bytes(),)

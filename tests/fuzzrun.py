@@ -148,11 +148,9 @@ class FuzzRun:
 
     @property
     def where(self) -> str:
-        """For the one who has to reproduce it."""
         return f"seed {self.seed}, cycle {self.loop.cycles}"
 
     def summary(self) -> str:
-        """The run in one line."""
         kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(self.bus.kinds.items()))
         return (
             f"seed {self.seed}: {self.bus.frames} frames in {self.loop.cycles} cycles ({kinds}); "
@@ -185,7 +183,6 @@ class FuzzRun:
                 self.cycle()
 
     def cycle(self) -> None:
-        """One cycle of the daemon's own loop."""
         self._stamp_ns += self.loop.period_ns
         self.due = [*self.due[1:], self.bus.tick + 1]
         if not self._passive:

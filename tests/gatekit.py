@@ -108,7 +108,6 @@ def _plant(kind: str, rng: np.random.Generator) -> tuple[JointPlant, float]:
 
 
 def _drive(kind: str, torque: float, rng: np.random.Generator) -> DriveHardware:
-    """A drive of that torque at the joint."""
     gear = {"geared": _between(rng, 50.0, 160.0), "none": 1.0}.get(kind, _between(rng, 5.0, 40.0))
     rated = torque / gear
     return DriveHardware(

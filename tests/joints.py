@@ -246,7 +246,6 @@ def record(
 
 
 def part(whole: Record, rows: slice | Array) -> Record:
-    """Some rows of a recording."""
     link = whole.link_position_rad
     return replace(
         whole,

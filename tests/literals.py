@@ -186,7 +186,6 @@ class Constant(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Its name for people."""
         return f"{self.module.removeprefix('estimator.')}.{self.key or self.name}"
 
     def set(self, factor: float) -> None:

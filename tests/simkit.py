@@ -18,11 +18,7 @@ _channels = itertools.count()
 
 
 class StubRig:
-    """Position 100 counts further each period, link 7; 0.5 A and 0.05 N·m; pi rad/s, which is 30 rpm.
-
-    Args:
-        drive: of each of its two motors.
-    """
+    """Position 100 counts further each period, link 7; 0.5 A and 0.05 N·m; pi rad/s, which is 30 rpm."""
 
     period_s = 0.001
 

@@ -11,7 +11,6 @@ from drivelink.errors import DriveError
 from estimator.sample import Sample, Status
 
 SYNC = 0x080
-MS = 1_000_000
 
 
 def run(assembler: Assembler, frames: list[tuple[int, bytes]]) -> list[Sample]:
@@ -136,20 +135,6 @@ def test_a_layout_that_cannot_be_is_refused_in_a_line_and_changes_nothing(tpdos)
         Assembler((drive(1, 0),), 2)
     with pytest.raises(DriveError, match="COB-ID 0x181 is used by two"):
         Assembler((drive(1, 0), drive(1, 1)), 2)
-
-
-def test_a_passive_listener_takes_no_start_for_a_mapping():
-    assembler = Assembler(VSA, 2, active=False)
-    assembler.feed(0x000, b"\x82\x00")  # a gateway begins with reset communication to all
-    assert assembler.untrusted == (1, 2, 3)
-    for node in (1, 2, 3):
-        assembler.feed(0x700 + node, b"\x00")
-        assembler.feed(0x700 + node, b"\x05")
-        assembler.feed(0x000, bytes((1, node)))
-    assert assembler.untrusted == (1, 2, 3)
-    for node in (1, 2, 3):
-        assembler.trust(node)
-    assert len(run(assembler, [(SYNC, b""), *vsa_cycle(1)])) == 1
 
 
 def test_every_second_sync_gives_every_second_sample():

@@ -22,7 +22,6 @@ CLOCKS_AND_IO = {
 
 @cache
 def nodes_of(path: Path) -> list[ast.AST]:
-    """All of a module's syntax tree."""
     return [*ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
 
 

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import json
-import logging
 import os
-import re
 import shutil
 import signal
-import sys
 import threading
 import time
 from datetime import UTC, datetime
@@ -23,7 +19,6 @@ from mcap.reader import make_reader
 from test_recording_recorder import joint_file
 
 from drivelink import cli, jointfile
-from drivelink.cli import blackbox as process_of_a_box
 from drivelink.cli import keep
 from drivelink.loop import blackbox
 from drivelink.loop.blackbox import AFTER_S, BlackBox
@@ -262,22 +257,6 @@ def test_with_the_same_wall_time_at_each_start_no_recording_takes_the_place_of_a
         scene.run(100)
         scene.run(200, Status.MODEL_ALARM)
         assert len(scene.finish()) == count
-
-
-def test_lines_of_the_black_box_carry_the_time_of_day_as_the_daemons_do(monkeypatch, capsys):
-    for owner, name, value in (
-        (sys, "argv", ["blackbox", "nowhere.toml"]),
-        (sys, "stdin", io.StringIO()),
-        (signal, "signal", lambda *_: None),
-        (os, "nice", lambda _: 0),
-        (logging.getLogger(), "handlers", []),
-        (logging.getLogger(), "level", logging.WARNING),
-    ):
-        monkeypatch.setattr(owner, name, value)
-    monkeypatch.delenv("JOURNAL_STREAM", raising=False)
-    assert process_of_a_box.main() == 2
-    said = r"\d\d:\d\d:\d\d E nowhere.toml: no black box: .*No such file or directory\n"
-    assert re.fullmatch(said, capsys.readouterr().err)
 
 
 def test_what_others_put_into_the_folder_stops_no_box_and_is_not_written_through(tmp_path, caplog):

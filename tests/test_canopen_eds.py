@@ -199,7 +199,6 @@ class RecordedSlave:
                 answers.append(line)
 
     def handle(self, cob_id: int, data: bytes) -> list[tuple[int, bytes]]:
-        """A frame in, and what was answered."""
         answers = self.left[f"> {cob_id:03X} {data.hex(' ').upper()}".rstrip()].pop(0)
         return [(int(line[2:5], 16), bytes.fromhex(line[6:])) for line in answers]
 

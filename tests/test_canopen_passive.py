@@ -251,11 +251,6 @@ def test_a_data_sheets_map_is_offered_and_not_believed(tmp_path):
     assert PassiveConfigurator([pasted], [tmp_path]).believed == {5}
 
 
-def test_what_a_recorder_lacks_without_a_daemon_is_the_daemon():
-    configurator = PassiveConfigurator([parse(joint_text(drive=STATED))])
-    assert "expected drivelink run to write it" in str(configurator.missing[5])
-
-
 def test_frames_that_are_heard_of_a_node_whose_map_is_unknown_are_named():
     configurator = PassiveConfigurator([parse(joint_text(drive=STATED, bus=PASSIVE))])
     after(configurator, (0x185, bytes(8)), (0x285, bytes(6)))

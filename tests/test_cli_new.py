@@ -1,5 +1,3 @@
-import io
-
 import pytest
 from daemonkit import served
 
@@ -52,14 +50,6 @@ def test_every_line_that_is_commented_out_is_valid_too(tmp_path):
             jointfile.parse(text.replace(line, line[2:], 1) if "inertia" not in line else text)
 
 
-@pytest.mark.parametrize("case", ["constant", "quadratic", "vsa-ii"])
-def test_a_case_is_a_copy_of_the_shipped_joint(tmp_path, case):
-    joint = made(tmp_path, "--case", case, "--name", "mine", "--interface", "socketcan", "--channel", "vcan0")
-    assert joint.name == "mine"
-    assert joint.sim.case == case
-    assert (joint.bus.interface, joint.bus.channel) == ("socketcan", "vcan0")
-
-
 NEW = [
     *((model, "single") for model in ("polynomial", "linear", "exponential", "vsa-ii", "none")),
     *(("polynomial", arrangement) for arrangement in ("antagonistic", "serial")),
@@ -105,13 +95,6 @@ def test_questions_are_asked_where_somebody_can_answer(tmp_path, monkeypatch, ca
     assert "48.2 g·cm² × 50² = 0.01205 kg·m²" in capsys.readouterr().out
     assert joint.bus.channel == "can3"
     assert [motor.drive.node_id for motor in joint.motor] == [7, 8]
-
-
-def test_questions_left_unanswered_are_one_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("sys.stdin", io.StringIO())
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
-    assert main(["new", str(tmp_path / "elbow.toml")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_the_bus_is_asked_who_is_there(tmp_path, request):

@@ -178,14 +178,6 @@ def test_a_console_without_unicode_gets_the_words_spelt_out(tmp_path, monkeypatc
         assert not drawn or len({len(line) for line in table}) == 1
 
 
-@pytest.mark.parametrize("verb", cli.VERBS)
-def test_help_fits_its_terminal(verb, monkeypatch):
-    for columns in (80, 120):
-        monkeypatch.setenv("COLUMNS", str(columns))
-        text = cli._verb_parser(cli.make_parser([verb]), verb).format_help()
-        assert max(map(len, text.splitlines())) <= columns, verb
-
-
 def test_a_joint_s_name_is_not_its_file(capsys, monkeypatch):
     monkeypatch.setattr("drivelink.pubsub.clientbase.joints", lambda: ["elbow"])
     assert main(["record", "elbow", "--out", "elbow.mcap"]) == main(["keep", "knee"]) == 2

@@ -169,16 +169,6 @@ def test_the_age_grows_until_it_is_stale_and_a_daemon_that_hangs_is_not_gone(pub
     until(lambda: impatient.state == "gone")
 
 
-def test_the_age_does_not_believe_the_senders_clock(publisher, joint):
-    """Stamps an hour ahead, or all the same: the age is still that on the local clock."""
-    for stamp_ns in (time.time_ns() + 3_600_000_000_000, 5, 5, 5):
-        before = time.monotonic()
-        joint.latest()  # the queue is seen empty now
-        put_estimate(publisher, make_estimate(stamp_ns % 7), stamp_ns)
-        assert joint.wait(LIMIT_S) is not None
-        assert 0.0 <= joint.age_s <= time.monotonic() - before
-
-
 def test_arrival_is_the_stamp_moved_by_the_smallest_difference_seen():
     """Estimates made each 1 ms, 0.2 ms under way, read each 10 ms: the age is exact to the clocks' drift."""
     offset_ns, way_ns = 123_456_789, 200_000

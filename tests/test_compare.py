@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import re
 from dataclasses import replace
 from functools import cache
@@ -20,7 +19,7 @@ from drivelink import cli, jointfile
 from drivelink.comparison import compare
 from drivelink.demo.simulate import alter, world_from_joint
 from drivelink.errors import DrivelinkError
-from drivelink.output.comparison import fits, simulated
+from drivelink.output.comparison import simulated
 from drivelink.output.document import show
 from estimator import Effect, EstimatorError, JointModel, LinkDynamics, Motor, Record, Transmission
 from estimator.filters import smoothed
@@ -72,18 +71,6 @@ def test_friction_that_nobody_declared_is_in_the_curve_and_in_the_free_run(runs)
     assert abs(abs(friction.b - friction.a) - 0.6) < 0.1
     (_, declared, fitted) = made.runs[0]
     assert min(fitted.fit_percent.values()) > 99.0 > 90.0 > max(declared.fit_percent.values())
-
-
-def test_motion_at_constant_velocity_stands_beside_a_free_run_only_where_it_beats_the_mean(runs):
-    run = compare(ELBOW, runs / "healthy.csv", horizon_s=1.0).runs[0][1]
-    names = run.channels
-    shown = []
-    for coasting in ([-500.0] * 3, [40.0, -500.0, math.nan]):
-        one = replace(run, coasting_percent=dict(zip(names, coasting, strict=True)))
-        (grid,) = fits({"declared": one}, "healthy.csv").blocks
-        shown.append((grid.head[-1], [row[-1] for row in grid.rows]))
-    assert shown[0][0] == "declared" and "diverges" not in shown[0][1]
-    assert shown[1] == ("at constant velocity", ["40.0 %", "below 0 %", "–"])
 
 
 def test_the_verb_writes_a_page_and_numbers(runs, capsys):
@@ -157,21 +144,6 @@ def test_the_free_run_of_the_true_model_is_what_another_integrator_gives():
     made = free_run(run(), replace(joint(effects=(FRICTION,)), link=None), 1.0)  # the measured link drives it
     assert made.channels == ("motor1_position", "motor1_deflection")
     assert min(made.fit_percent.values()) > 98.0
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {},  # without the friction
-        {"effects": (FRICTION,), "inertia_kg_m2": 0.026},
-        {"effects": (FRICTION,), "transmission": Transmission(model="linear", parameters={"k_nm_rad": 6.0})},
-    ],
-)
-def test_a_wrong_model_fits_worse(wrong):
-    right, worse = (
-        free_run(run(), one, 0.5).fit_percent for one in (joint(effects=(FRICTION,)), joint(**wrong))
-    )
-    assert all(worse[name] < right[name] - 1.0 for name in ("motor1_position", "motor1_deflection"))
 
 
 def test_the_horizon_shrinks_until_a_drifting_run_fits_and_windows_begin_behind_each_gap():

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import controllerkit as kit
 import pytest
 import run as program
-from controller import Controller, Cycle, Settings, deflections
+from controller import Controller, Cycle, Settings
 from drives import MOST_RESETS
 
 from drivelink import jointfile
@@ -151,7 +151,6 @@ QUICK_NM = kit.QUICK.torque_nm
 
 
 def written(rig) -> set[int]:
-    """Indices of the objects that were written by SDO."""
     frames = (data for cob, data in rig.sent if 0x600 < cob < 0x680 and data[0] >> 5 == 1)
     return {int.from_bytes(data[1:3], "little") for data in frames}
 
@@ -225,53 +224,6 @@ def test_one_bad_cycle_is_enough(what, reason):
     assert controller.step(0.4 + late_s, cycle, **drives) == NO_TORQUE
     assert (controller.phase, events[-1][1]) == ("safe", reason)
     assert cycle or events[-1][2] == pytest.approx(0.011)
-
-
-def test_a_person_sees_where_the_joint_is_and_goes_and_a_program_its_phases(monkeypatch, capsys):
-    monkeypatch.setattr(time, "strftime", lambda _: "08:15:00")
-    for as_json, expected in (
-        (False, "08:15:00 safe: stopped\n08:15:00 identify link "),
-        (True, "{"),
-    ):
-        view, (controller, _) = program.View(as_json), moving()
-        view.report("safe", "stopped", 0.01)
-        for _ in range(3):  # once a second
-            view.show(controller)
-        printed = capsys.readouterr().out
-        assert printed.startswith(expected) and printed.count("\n") == (1 if as_json else 2)
-        assert as_json or " N·m/rad, motors " in printed
-    unknown = estimate(400, 0)._replace(stiffness_nm_rad=math.nan)
-    controller.step(0.4, Cycle(unknown, sample(400)), enabled=True, faulted=False)
-    assert " rad, stiffness – N·m/rad" in str(controller)
-    controller.phase = "run"
-    assert " (to +0.00) rad, stiffness " in str(controller)
-
-
-def test_torques_stay_within_the_limit():
-    controller, _ = moving(torque_nm=0.01)
-    largest = 0.0
-    for k in range(400, 2000):
-        torques = controller.step(k * 1e-3, Cycle(estimate(k, 0), sample(k)), enabled=True, faulted=False)
-        largest = max(largest, *map(abs, torques))
-    assert largest == 0.01
-
-
-@pytest.mark.parametrize(("torque", "sigma"), [(0.0, 0.5), (-0.1, 0.7), (0.12, 0.6)])
-def test_springs_are_taken_when_all_are_possible_and_deflections_give_what_is_asked_for(torque, sigma):
-    controller, _ = moving()
-    good = {"model": "vsa-ii", "parameters": kit.SPRING}
-    for parameters in ({}, {"k_nm_rad": 0.5, "c": 0.9}):
-        controller.set_springs(
-            [good, {"model": "vsa-ii" if parameters else "polynomial", "parameters": parameters}]
-        )
-        assert controller._springs == ()
-    controller.set_springs([good, good])
-    first, second = controller._springs
-    one, two = deflections((first, second), torque, sigma, (0.5, -0.5))
-    assert first(one)[0] + second(two)[0] == pytest.approx(torque, abs=1e-7)
-    assert first(one)[1] + second(two)[1] == pytest.approx(sigma, abs=1e-7)
-    impossible = deflections((first, second), 0.1, 0.05, (0.5, -0.5))
-    assert all(map(math.isfinite, impossible))
 
 
 def test_the_process_ends_the_torque_a_deadline_and_a_look_after_the_last_estimate(monkeypatch):

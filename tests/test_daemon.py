@@ -1,7 +1,6 @@
 """The daemon's life: what it publishes, how it starts and ends, another model in the running loop."""
 
 import argparse
-import math
 import os
 import threading
 import time
@@ -37,24 +36,6 @@ def no_thread_left() -> Iterator[None]:
     before = set(threading.enumerate())
     yield
     assert {thread.name for thread in set(threading.enumerate()) - before} == set()
-
-
-LINK = """
-[link.dynamics]
-inertia_kg_m2 = 0.003
-viscous_damping_nm_s_rad = 0.001
-gravity_nm = 0.2943
-"""
-
-
-def test_the_status_has_the_external_torque_where_the_link_is_declared():
-    with rig() as made:
-        made.run(10)
-        assert made.status["external"] is None
-    with rig(parse(vsa_text() + LINK)) as made:
-        made.run(10)
-        begin = made.status["external"]
-        assert (begin["valid"], begin["contact"]) == (False, False) and math.isnan(begin["torque_nm"])
 
 
 def test_the_uptime_is_not_that_of_a_clock_that_was_set(monkeypatch):
@@ -339,7 +320,6 @@ case = "constant"
 
 @contextmanager
 def two_joints() -> Iterator[Daemon]:
-    """Elbow (two motors) and wrist (one) in one daemon."""
     elbow = vsa(bus="period_s = 0.002")
     wrist = parse(SINGLE.format(channel=elbow.bus.channel))
     joints = (elbow, wrist.model_copy(update={"bus": elbow.bus, "zenoh": elbow.zenoh}))

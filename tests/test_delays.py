@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from estimator.diagnosis import diagnose
-from estimator.diagnosis.findings import stamped_wrongly
 from estimator.identify import identify
 from estimator.sample import Record
 
@@ -24,15 +23,6 @@ def slow(record: Record) -> Record:
         motor_torque_nm=record.motor_torque_nm.reshape(-1, EVERY).mean(axis=1)[:, None],
         link_position_rad=record.link_position_rad[::EVERY],
     )
-
-
-@pytest.mark.parametrize(
-    ("delay_s", "period_s", "usual"), [(0.014, 1e-3, True), (0.016, 1e-3, False), (0.025, 1e-2, True)]
-)
-def test_tens_of_milliseconds_are_no_delay_of_a_drive_unless_it_samples_as_slowly(delay_s, period_s, usual):
-    for sign in (1.0, -1.0):
-        assert (stamped_wrongly("encoder_delay", sign * delay_s, period_s) is None) == usual
-        assert stamped_wrongly("torque_offset", sign * delay_s, period_s) is None
 
 
 def test_fit_writes_a_delay_of_two_samples_and_none_of_tens_of_milliseconds():

@@ -5,7 +5,6 @@ import itertools
 import json
 import math
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -19,14 +18,14 @@ from rich.console import Console
 from zenohkit import LIMIT_S, until
 
 from drivelink import cli, jointfile
-from drivelink.demo.closedloop import CASES, STEPS, ClosedLoop
+from drivelink.demo.closedloop import STEPS
 from drivelink.demo.closing import Comparison, as_json
 from drivelink.demo.closing import closing as closing_section
 from drivelink.demo.rig import RunSummary
 from drivelink.demo.watching import DemoRun, RigProcess
 from drivelink.monitor.history import TruePoint
 from drivelink.monitor.view import JointView
-from drivelink.output.document import Paragraph, Section, show
+from drivelink.output.document import show
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Status, TransmissionEstimate
 
@@ -127,18 +126,6 @@ def test_the_demo_finds_the_stiffness_it_does_not_know(case):
     assert result["flexibility_torque_error_relative"] < 0.03
 
 
-@pytest.mark.parametrize("terminal", [True, False])
-def test_a_terminal_breaks_what_is_said_between_words_and_a_file_not_at_all(terminal):
-    out, words = io.StringIO(), "on held-out data the error of the motor torque falls from 8.99 % to 0.52 %"
-    console, path = Console(file=out, force_terminal=terminal, width=40), ELBOW
-    case = CASES["friction"]
-    run = ClosedLoop(jointfile.load(path), path, case, console, live=False, yes=True, limit_s=1.0)
-    for say in (run._say, lambda text: show([Section("", [Paragraph(text)])], console)):
-        say(words)
-        assert " ".join(out.getvalue().split()) == words and (out.getvalue().count("\n") > 1) is terminal
-        out.seek(out.truncate(0))
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_loop_closes_on_what_nobody_declared():
@@ -152,15 +139,6 @@ def test_the_loop_closes_on_what_nobody_declared():
     assert result["error"]["after_rms_nm"] < 0.25 * result["error"]["before_rms_nm"]
     steps = [result[f"{step}_s"] for step in STEPS]
     assert steps == sorted(steps) and "Traceback" not in done.stderr
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_the_demo_with_its_results():
-    out = interrupted("--headless", "--case", "constant", valid_lines=1)
-    assert "truth beside estimate" in out
-    assert "relative to the truth's rms" in out and "held the truth in" in out and "…" not in out
-    errors = [float(number) for number in re.findall(r"([\d.]+) % │", out)]
-    assert len(errors) == 2 and max(errors) < 3.0
 
 
 def interrupted(*options: str, valid_lines: int) -> str:

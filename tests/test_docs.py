@@ -17,7 +17,6 @@ from types import ModuleType
 
 import daemonkit
 import pytest
-from chromium import Chromium
 
 from drivelink import cli, jointfile
 from drivelink.jointfile.columns import UNITS
@@ -163,31 +162,12 @@ def test_examples_are_listed_valid_and_their_cases_those_of_the_package():
         assert (ROOT / "examples" / path.name).read_text(encoding="utf-8") == path.read_text(encoding="utf-8")
 
 
-def test_each_of_ten_decisions_names_its_rival_and_a_figure():
-    text = (DOCS / "explanation" / "decisions.md").read_text(encoding="utf-8")
-    decisions = re.split(r"^## \d+\. ", text, flags=re.MULTILINE)[1:]
-    assert len(decisions) == 10
-    for decision in decisions:
-        assert re.search(r"\*Rival\*: .*\d", decision, re.DOTALL), decision
-
-
 def test_the_workflow_and_the_hooks_run_programs_that_are_there():
     workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
     assert "- run: .ci/run\n" in workflow and (ROOT / ".ci" / "run").stat().st_mode & 0o100
     hooks = re.findall(r"entry: (.*)", (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))
     run = (ROOT / ".ci" / "run").read_text(encoding="utf-8").replace("check .", "check")
     assert hooks and all(hook.removesuffix(" --force-exclude") in run for hook in hooks)
-
-
-def test_the_script_of_pictures_asks_of_the_browser_what_it_can():
-    """It needs Chromium and minutes: no test runs it."""
-    tree = ast.parse((DOCS / "pictures.py").read_text(encoding="utf-8"))
-    asked = {
-        node.attr
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "browser"
-    }
-    assert asked and asked <= set(dir(Chromium))
 
 
 @pytest.mark.slow

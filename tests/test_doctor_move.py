@@ -41,9 +41,9 @@ counts_per_rev = 4096.0
 """
 
 
-def joint(arrangement: str = "single", gear: float = 1.0, axis: str = "rotary") -> JointFile:
+def joint(arrangement: str = "single", gear: float = 1.0) -> JointFile:
     more = "" if arrangement == "single" else SECOND
-    return parse(f'axis = "{axis}"\n' + JOINT.format(arrangement=arrangement, gear=gear, more=more))
+    return parse(JOINT.format(arrangement=arrangement, gear=gear, more=more))
 
 
 class HandMovedJoint:
@@ -147,33 +147,6 @@ def test_what_was_not_seen_is_not_ticked():
     assert seen["motor1_position"].good is None and "did not follow" in seen["motor1_position"].text
     assert seen["motor1_torque"].good is None and "does the drive hold?" in seen["motor1_torque"].text
     assert done.paste == []
-
-
-def test_a_linear_axis_is_moved_in_millimetres_and_pushed_in_newtons():
-    rig = HandMovedJoint({})
-    done = check_by_hand(joint(axis="linear"), rig, rig)
-    assert done.good and done.paste == []
-    assert any("+51 mm (+0.051) for +50 mm (+0.05)" in line for line in rig.said)
-    assert any("-1.5 N against the push" in line for line in rig.said)
-    rig = HandMovedJoint({"link_position": 1e3}, {"Move": "0.051 m"})  # counts taken for millimetres
-    done = check_by_hand(joint(axis="linear"), rig, rig)
-    assert done.paste == ["link.encoder.counts_per_rev = 6.5536e+07"]
-    rig = HandMovedJoint({}, {"Move": "90 deg"})
-    rig.ask = once(rig.ask, "Move", "51")  # type: ignore[method-assign]
-    assert check_by_hand(joint(axis="linear"), rig, rig).good
-    assert "expected an amount like 50 or 0.2 m, got 90 deg" in rig.said
-
-
-def once(ask: Callable[..., str], start: str, then: str) -> Callable[..., str]:
-    """`ask`, which answers otherwise when it is asked a second time."""
-    asked = []
-
-    def answer(text: str, meanwhile: Callable[[], object]) -> str:
-        asked.append(text)
-        again = text.startswith(start) and asked.count(text) > 1
-        return then if again else ask(text, meanwhile)
-
-    return answer
 
 
 def test_of_two_motors_each_torque_has_its_own_gear_and_what_is_not_read_is_not_judged():

@@ -63,10 +63,6 @@ def test_every_effect_that_a_joint_file_may_hold_runs_on_line(name):
     assert math.isfinite(estimate.flexibility_torque_nm)
 
 
-def test_a_stiff_joint_has_a_large_coefficient_of_a_high_power():
-    assert _joint(Effect(name="higher_order_stiffness", parameters={"coefficient": -1.2e13, "power": 5.0}))
-
-
 def test_arrays_of_parameters_are_sums_of_elements():
     waves = {"sin_nm": (1.0, 0.5), "cos_nm": 0.0, "periods_per_rev": (6.0, 12.0)}
     made = elements(Effect(name="cogging", parameters=waves))[1]

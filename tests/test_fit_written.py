@@ -22,9 +22,7 @@ import pytest
 from drivelink import jointfile, recording
 from drivelink.cli import main
 from drivelink.errors import JointFileError
-from drivelink.output.fitreport import _effects
-from drivelink.output.numbers import Units
-from estimator import Effect, fit
+from estimator import fit
 from estimator.identify import identify
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -173,12 +171,6 @@ def test_what_is_printed_is_what_is_written(model, link, run, folder):
         known = {k: own[k] for k in ("inertia_kg_m2", "viscous_damping_nm_s_rad")}
         assert known == dict(_numbers(motor))
         assert entry.get("effects", []) == motor.get("effect", [])
-
-
-def test_an_effect_that_was_fitted_is_printed_with_its_interval():
-    effect = Effect(name="deflection_offset", parameters={"offset_rad": 1.3e-5}, std={"offset_rad": 4.6e-5})
-    (row,) = _effects((effect,), Units(False))
-    assert row == ("deflection_offset.offset_rad", "1.3e−5", "9.0e−5", "rad")
 
 
 @pytest.mark.parametrize(

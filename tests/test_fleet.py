@@ -131,14 +131,6 @@ def test_a_recording_larger_than_the_memory_is_cut_into_parts(joints, tmp_path, 
     assert any("cut into 2 parts" in note for note in outcome.notes)
 
 
-@pytest.mark.slow
-def test_a_recording_before_that_is_gone_is_said(fleet, joints):
-    gone = Source("/gone.csv", 1, "", None)
-    outcome = done(fleet / "recordings" / "wrist-2026-01-06.csv", joints, previous=gone)
-    assert outcome.rows[0]["validated_on"] == task.HELD_OUT
-    assert "validated on held-out blocks" in outcome.notes[0]
-
-
 # Storage
 
 

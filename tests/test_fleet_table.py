@@ -8,7 +8,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-import chromium
 import fleetkit
 import numpy as np
 import pytest
@@ -29,7 +28,6 @@ from drivelink.fleet.table import FleetTable, read_rows
 
 
 def append(folder: Path, *rows: dict[str, Any]) -> None:
-    """As a run does it."""
     with FleetTable(Store(str(folder))) as one:
         one.append([*rows])
 
@@ -122,7 +120,6 @@ def night(joint: str, k: int, stiffness: float, effects: list[str]) -> dict[str,
 
 
 def sentence(*rows: dict[str, Any]) -> str:
-    """What the page says of a joint."""
     (joint,) = summarise([*rows], 0.05)["joints"]
     return str(joint["sentence"])
 
@@ -199,31 +196,6 @@ def test_damping_zero_and_parameters_of_sure_effects_are_tested_for_changes_and_
     assert drawn.count('class="when"') == (3 if probability == 1.0 else 2)
 
 
-def test_a_linear_axis_has_metres_and_newtons():
-    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) | {"axis": "linear"} for k in range(10)]
-    text = page(summarise(rows, 0.05))
-    assert "at a deflection of 0.02 m, N/m; scatter" in text and "viscous damping, N·s/m<" in text
-    assert "N·m" not in text and " rad" not in text
-
-
-def test_a_stiffness_that_says_nothing_at_the_common_deflection_is_no_point():
-    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
-    rows[4] |= {"covariance": [80.0**2]}
-    (joint,) = summarise(rows, 0.05)["joints"]
-    assert len(joint["transmissions"][0]["series"]) == 9
-    assert [one["reason"] for one in joint["unusable"]] == ["its motion does not reveal the stiffness"]
-
-
-def test_a_place_where_nothing_is_new_shows_all_that_is_found_there():
-    rows = [
-        night("elbow", k, 150.0, ["presliding_friction@motor"] + ["cogging@motor"] * (k > 7))
-        for k in range(10)
-    ]
-    (joint,) = summarise(rows, 0.05)["joints"]
-    (effect,) = joint["effects"]
-    assert (effect["names"], effect["recordings"]) == (["presliding_friction", "cogging"], 10)
-
-
 @pytest.mark.parametrize("rigid", [{}, {"model": "none", "excited": False, "deflection_offset_rad": None}])
 @pytest.mark.parametrize(
     ("nights", "said"), [(1, "Too few recordings"), (5, "Too few recordings"), (6, "Steady.")]
@@ -259,46 +231,6 @@ def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_cha
     assert "<h1>1 of 1 joint needs a look: 1 lost</h1>" in text and "<th>why it could not be used" in text
     assert "hollow: the model was not sufficient" in text
     assert text.count('class="found"') == 4 and "134 → 2.00 % of the torque" in text
-
-
-def test_what_the_last_recordings_agree_on_is_said_with_the_day_since_which_they_do():
-    found = {
-        "verdict": "effect",
-        "effects": ["coulomb_friction@motor1"],
-        "sentence": "The model lacks Coulomb friction.",
-    }
-    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) | (found if k >= 9 else {}) for k in range(12)]
-    last = "The last 3 of 12 recordings, since 2026-01-14, agree: The model lacks Coulomb friction."
-    assert sentence(*rows) == last
-    assert sentence(*rows[:10]).startswith("No significant change, but the last recording says: ")
-
-
-CUT = "[...document.querySelectorAll('figure, .table')].filter(e => e.scrollWidth > e.clientWidth).length"
-
-SMALLEST = """Math.min(...[...document.querySelectorAll('.large text')].filter(e => e.getClientRects().length)
-.map(e => parseFloat(getComputedStyle(e).fontSize) * e.getScreenCTM().a))"""
-
-SHOWN = """[...document.querySelectorAll('.joints tr')].filter(row => row.offsetHeight)
-.sort((a, b) => a.offsetTop - b.offsetTop).map(row => row.querySelector('th').textContent)"""
-
-
-@pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
-def test_a_phone_shows_charts_and_tables_whole_and_joints_are_sorted_and_hidden(tmp_path):
-    rows = [
-        night("wrist", k, 150.0 + 4.0 * (k >= 12), ["coulomb_friction@motor"] if k >= 9 else [])
-        for k in range(20)
-    ] + [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(20)]
-    (tmp_path / "fleet.html").write_text(page(summarise(rows, 0.05)), encoding="utf-8")
-    with chromium.Chromium(tmp_path / "profile") as browser:
-        browser.resize(390, 800)
-        browser.open((tmp_path / "fleet.html").as_uri())
-        assert browser.evaluate(CUT) == 0
-        assert browser.evaluate(SMALLEST) > 8.0  # letters that can be read
-        assert browser.evaluate(SHOWN) == ["wrist", "elbow"]  # by urgency
-        browser.evaluate("document.getElementById('by1').click()")
-        assert browser.evaluate(SHOWN) == ["elbow", "wrist"]  # by name
-        browser.evaluate("document.getElementById('show-steady').click()")
-        assert browser.evaluate(SHOWN) == ["wrist"]
 
 
 def test_the_examples_of_the_documentation_read_the_table(tmp_path, monkeypatch, capsys):

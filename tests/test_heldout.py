@@ -34,7 +34,6 @@ def motion(amplitude: float = 1.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     time = np.arange(round(SECONDS / T)) * T
 
     def wave(order: int, at: FloatArray, scale: FloatArray) -> FloatArray:
-        """A derivative of a sum of the tones."""
         return np.asarray(np.sin(np.outer(at, w) + 0.5 * np.pi * order) @ (scale * w**order))
 
     later = time + 0.5 * T

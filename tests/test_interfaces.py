@@ -27,12 +27,7 @@ PERIOD_S = 0.01
 
 
 class SerialAdapter:
-    """An slcan adapter on a pseudo terminal; its CAN side is a python-can virtual channel.
-
-    Args:
-        link: what the serial device is called; it may be pulled out and put in again.
-        channel: of the virtual bus.
-    """
+    """An slcan adapter on a pseudo terminal; its CAN side is a python-can virtual channel."""
 
     def __init__(self, link: Path, channel: str) -> None:
         self._link = link

@@ -163,19 +163,6 @@ def test_a_rewritten_model_keeps_everything_else_and_its_comments(tmp_path, text
     assert not target.exists()
 
 
-def test_a_new_table_has_a_blank_line_before_and_after_it_and_old_ones_stay_as_they_are(tmp_path):
-    path, old = tmp_path / "elbow.toml", ELBOW.replace("\n\n[", "\n[")
-    path.write_text(old, encoding="utf-8")
-    effect = {"name": "torque_offset", "parameters": {"torque_nm": 0.2}}
-    transmission = {"parameters": {"coefficients_nm_rad": [100.0, 500.0]}}
-    changes = {"motor": [{"transmission": transmission, "effect": [effect, effect]}], "provenance": {"a": 1}}
-    jointfile.write_model(jointfile.load_text(path), path, changes, force=True)
-    lines = path.read_text(encoding="utf-8").splitlines()
-    pairs = [(above, line) for above, line in itertools.pairwise(lines) if line.startswith("[")]
-    assert all((above == "") == (not {above, line} <= {*old.splitlines()}) for above, line in pairs)
-    assert ("", "") not in itertools.pairwise(lines)
-
-
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
     """A joint file as `fit --write` leaves it."""

@@ -18,13 +18,12 @@ import zenohkit
 from rich.console import Console
 
 from drivelink import cli
-from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
 from drivelink.monitor.statuslines import shape, status_lines
-from drivelink.monitor.terminal import can_draw, joints_table
+from drivelink.monitor.terminal import joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.web import snapshot
-from drivelink.output.numbers import among, axis_labels, number, with_interval
+from drivelink.output.numbers import number, with_interval
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
@@ -82,17 +81,6 @@ def test_the_view_says_what_matters_at_80_by_24():
                  "valid", "observable", "bus 38 %"):  # fmt: skip
         assert part in text, part
     assert sum(ord(c) > 0x2800 and ord(c) < 0x2900 for c in text) > 100  # the curves
-
-
-def test_without_a_bus_no_node_is_operational_and_what_several_nodes_lack_is_said_once():
-    view = filled()
-    view.status = view.status | {
-        "state": "bus lost",
-        "conditions": [f"node {k}: frames are missing" for k in (1, 2)],
-    }
-    text = "\n".join(lines(view, 120, 40))
-    assert "1 not heard" in text and "operational" not in text
-    assert "nodes 1, 2: frames are missing" in text
 
 
 def test_a_view_without_anything_yet_says_so():
@@ -207,58 +195,6 @@ def test_numbers_are_short_and_their_digits_follow_the_uncertainty(value, half, 
         assert with_interval(value, half, "N·m") == f"{text} N·m"
 
 
-@pytest.mark.parametrize(
-    ("values", "labels"),
-    [
-        ([-0.0938, -0.0312, 0.0314], "−0.094 −0.031 0.031"), ([6.48e-4, 2.93e-4, -6.2e-5], "6.5e−4 2.9e−4 −0.6e−4"),
-        ([-12.0, -6.0, -1e-9], "−12.0 −6.0 0.0"), ([120.0, 121.0], "120.0 121.0"), ([1e7, 2e7], "1.0e7 2.0e7"),
-    ],
-)  # fmt: skip
-def test_the_labels_of_an_axis_have_one_power_of_ten_and_digits_of_their_distance(values, labels):
-    assert " ".join(axis_labels(values)) == labels
-
-
-@pytest.mark.parametrize(
-    ("value", "largest", "text"),
-    [
-        (0.0376, 0.1, "0.0376"), (2.1e-4, 0.1, "0.0002"), (-4e-6, 0.25, "0.0000"), (-6.242, 8.0, "−6.242"),
-        (2e-5, 4e-4, "0.200e−4"), (math.nan, 1.0, "–"), (2e-4, math.nan, "2.000e−4"),
-    ],
-)  # fmt: skip
-def test_a_value_of_a_series_has_the_digits_of_its_largest(value, largest, text):
-    assert among(value, largest) == text
-
-
-def test_a_torque_or_deflection_that_passes_zero_does_not_change_its_notation():
-    view = filled(truth=True)
-    one = TransmissionEstimate(2.1e-4, 100.0, 2.0, -3e-5)
-    view.update(Estimate(5000, 3, 2.1e-4, 200.0, 4.0, (one, one)), 5.0, Truth(2e-4, 200.0))
-    table = Console(width=120, record=True, file=io.StringIO())
-    table.print(joints_table({"elbow": view}, 120))
-    for text in ("\n".join(lines(view)), view.line(), table.export_text()):
-        assert "e−" not in text and "0.0000" in text  # the deflection
-
-
-def test_an_error_of_the_valid_cycles_does_not_stand_beside_an_estimate_that_is_not():
-    view = filled(truth=True)
-    last = estimate(5000, status=0)
-    view.update(last, 5.0, Truth(last[2], last[3]))
-    assert "truth" in "\n".join(lines(view)) and " error " not in "\n".join(lines(view)) + view.line()
-
-
-def test_sparkline_and_plot_take_anything_and_are_never_wider_than_their_room():
-    assert sparkline([], 10) == "" and sparkline([math.nan] * 3, 10) == "   "
-    assert sparkline([1.0, 2.0, 3.0], 10) == "▁▅█" and len(sparkline(list(range(1000)), 17)) <= 17
-    plot = DotPlot(40, 10, (math.nan, math.nan), (1.0, 1.0))
-    plot.curve([(0.0, 1.0), (math.inf, 0.0), (0.5, 1.0)], "")
-    plot.band([(0.5, -math.inf, math.nan)], "")
-    assert len(plot.render("t").plain.split("\n")) == 10
-    for y in ((-0.0611, 0.0995), (-1.234e-5, 2e-5), (1e7, 2e7), (0.0, 1.0), (-120.0, 3.0)):
-        plot = DotPlot(37, 12, (-0.526, 0.429), y)
-        plot.curve([(-0.5, y[0]), (0.4, y[1])], "")
-        assert max(map(len, plot.render("torque over time, N·m", "rad").plain.split("\n"))) == 37
-
-
 # Between processes
 
 
@@ -313,13 +249,6 @@ def test_a_joint_that_nobody_serves_is_not_live_and_the_nearest_is_named(daemon,
     displayed = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert displayed["joint"] == "elbwo" and not displayed["live"] and "estimate" not in displayed
     assert displayed["state"] == 'no daemon of "elbwo"; did you mean "elbow"?'
-
-
-def test_a_live_view_needs_a_terminal_with_its_characters():
-    for encoding, able in (("utf-8", True), ("ascii", False), ("latin-1", False)):
-        file = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
-        assert can_draw(Console(file=file, force_terminal=True)) is able
-        assert not can_draw(Console(file=file, force_terminal=False))
 
 
 def test_plain_lines_repeat_nothing_and_end_where_nobody_serves_the_joint(daemon, capsys, monkeypatch):
@@ -383,17 +312,6 @@ def test_the_residual_is_a_gauge_against_its_baseline_before_and_after():
     displayed = snapshot(view, True, {})
     assert displayed["status"]["balances"][0][3] == pytest.approx(3.0) and displayed["residuals"]
     assert "residual 3.0" in view.line() and "8.1 % before its effects, 1.2 % after" in view.line()
-
-
-@pytest.mark.parametrize(
-    ("watching", "why"), [(True, "its filters are settling"), (False, "no baseline: drivelink fit")]
-)
-def test_a_residual_without_gauge_is_not_always_one_without_baseline(watching, why):
-    view = filled()
-    view.status = {"residual_nm": 0.0, "residual_alarm": {"active": watching, "watching": watching}}
-    assert "0.00 N·m" not in f"{view.line()}{lines(view)}"  # there is none
-    assert snapshot(view, True, {})["status"]["no_gauge"].startswith(why)
-    assert why in "\n".join(lines(view, 120, 40))
 
 
 def test_every_view_says_what_to_do_on_a_model_alarm():

@@ -161,7 +161,6 @@ def test_a_recording_takes_the_place_of_another_one_with_its_first_block(folder)
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Four seconds of a linear joint, as CSV."""
     rng = np.random.default_rng(5)
     plants = joints.Plants(*joints.polynomial(np.array([[[100.0]]])), 0.5, 0.8, 0.4, 0.2, 5.0)
     truth = joints.simulate(plants, joints.sweep(rng, 4000, 1, 1, 0.001, 8.0, 3.0), 0.001)

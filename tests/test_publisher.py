@@ -89,7 +89,6 @@ def test_a_new_subscriber_gets_the_last_status_and_model_at_once(publisher, clie
 
 @pytest.fixture
 def answering(publisher):
-    """Answers as the daemon's housekeeping does."""
     with repeated(publisher.answer, 0.05):
         yield
 
@@ -107,7 +106,6 @@ def test_a_flood_of_queries_waits_for_the_slack_and_most_of_it_is_dropped(publis
 
 
 def ask(session, key):
-    """The only answer to a query."""
     (reply,) = list(session.get(f"drivelink/elbow/{key}", timeout=LIMIT_S))
     assert reply.ok is not None and str(reply.ok.encoding) == "application/json"
     return json.loads(reply.ok.payload.to_bytes())

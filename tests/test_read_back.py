@@ -44,7 +44,6 @@ def scales(made, node):
 
 
 def uploads(made):
-    """SDO requests that are sent from now on."""
     found, source = [], made.daemon.loop.source
     inner = source.send
     source.send = lambda cob_id, data: (cob_id >= 0x600 and found.append((cob_id, data)), inner(cob_id, data))

@@ -5,19 +5,16 @@ import random
 import struct
 import zlib
 from io import BytesIO
-from types import SimpleNamespace
 
 import can
 import pytest
 
-from drivelink.cycle.objectcheck import RecentSamples
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.recording.canlog import CAN_FORMATS, NO_STAMP, LoggedFrame, read_frames
-from drivelink.recording.cycles import Assembly, SyncNumbering, numbered_ahead, numbered_at_once
+from drivelink.recording.cycles import SyncNumbering, numbered_ahead, numbered_at_once
 from drivelink.recording.formats import open_sink
 from drivelink.recording.limits import AscText
-from estimator.sample import Sample
 
 JOINT = parse('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[bus]\nchannel = "can0"\n')
 FRAME = LoggedFrame(1_436_509_052_249_713_000, 0x181, bytes.fromhex("2A366C2BBA"), "can0")
@@ -172,15 +169,6 @@ def test_a_recorder_numbers_by_the_period_that_sync_has(factor):
     jumps = [jump for frame in frames for _, jump in numbering.push(frame)]
     jumps += [jump for _, jump in numbering.rest()]
     assert jumps == [1] * 300
-
-
-def test_a_sample_that_the_next_sync_completes_has_the_stamp_of_its_own():
-    assembly, made = Assembly.__new__(Assembly), iter([None, Sample(0, (0.0,), (0.0,), (0.0,), 0.0)])
-    assembly._stamp_ns = assembly._before_ns = 0
-    assembly.assembler = SimpleNamespace(feed=lambda *_: next(made), sequence=1, flags=0, missed=-1)
-    assembly.follower, assembly._recent = SimpleNamespace(feed=lambda *_: None), RecentSamples(1e-3)
-    assembly._period_s = 1e-3
-    assert [cycle.stamp_ns for cycle in assembly.cycles(syncs([1e-4, 2e-4]), 1)] == [100]
 
 
 def test_only_lines_of_an_asc_file_that_say_something_are_looked_at(tmp_path):

@@ -20,7 +20,7 @@ from fuzzparsers import JOINT, RECORDINGS, TEXT, frames, held, read_every_way, w
 from drivelink.canopen.eds import load_eds
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import ZenohSection, load
-from drivelink.recording import canframes, mcapfile, read
+from drivelink.recording import canframes, read
 from drivelink.recording.canlog import CAN_FORMATS, read_frames
 from drivelink.recording.corrections import Gathered
 from drivelink.recording.formats import FORMATS, open_sink
@@ -45,7 +45,6 @@ def little_memory(most_mib=220):
 
 @contextmanager
 def one_line(match=".", error=RecordingError):
-    """One line of an error comes of it, which says this."""
     with pytest.raises(error, match=match) as caught:
         yield
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 600
@@ -146,7 +145,6 @@ def log_of(path, wanted):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """One short recording in every format."""
     folder = tmp_path_factory.mktemp("whole")
     for suffix in RECORDINGS:
         write_recording(folder / f"r{suffix}")
@@ -288,25 +286,6 @@ def test_a_huge_message_is_refused_before_it_is_parsed(topic, begin, tmp_path):
                 work()
 
 
-def test_equal_frames_of_a_joint_at_rest_are_parsed_once(tmp_path, monkeypatch):
-    parsed = []
-    monkeypatch.setattr(canframes, "message_fields", lambda text: parsed.append(text) or message_fields(text))
-    at_rest = [(stamp, can_id, b"\x64\0" * (len(data) // 2)) for stamp, can_id, data in frames(2000)]
-    texts = [("can", stamp, f'{{"id":{i},"data":"{d.hex()}","rest":1}}'.encode()) for stamp, i, d in at_rest]
-    assert len(read(mcap_of(tmp_path / "r.mcap", texts), JOINT)) == 2000
-    assert len(parsed) == 3
-
-
-def test_estimates_of_no_samples_are_not_read_to_their_end(tmp_path, monkeypatch):
-    parsed = []
-    monkeypatch.setattr(mcapfile, "message_fields", lambda text: parsed.append(1) or message_fields(text))
-    estimates = [("estimate", k, b'{"sequence":%d,"status":3}' % k) for k in range(60_000)]
-    path = mcap_of(tmp_path / "r.mcap", estimates)
-    with one_line("no samples in it"):
-        list(open_playback(path, JOINT, tmp_path))
-    assert len(parsed) < 40_000
-
-
 def test_frames_are_the_same_whether_drivelink_or_another_tool_wrote_them(tmp_path):
     for data, wrong in (("", 0), ("00ff", 0), ("0", 1), ("00" * 65, 1)):
         for text in ('{"id":%d,"data":"%s"}', '{ "data": "%s", "id": %d }'):
@@ -351,7 +330,6 @@ def blf_container(packed, frames_):
 
 
 def blf_of(path, frames_, containers):
-    """A BLF file of containers with so many frames each."""
     path.write_bytes(BLF_HEAD + blf_container(zlib.compress(blf_frame() * frames_, 9), frames_) * containers)
     return list(read_frames(path))
 

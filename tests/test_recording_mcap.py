@@ -229,7 +229,6 @@ def writer(path, before=""):
 
 
 def count(path):
-    """Samples, or frames, in a recording."""
     if path.suffix == ".mcap":
         return sum(m.topic == "/elbow/sample" for m in read_messages(path))
     if path.suffix == ".csv":

@@ -26,7 +26,6 @@ def joint_file(folder, endpoint):
 
 
 def samples_in(path):
-    """How many samples are on the disk so far."""
     if not path.exists() or not path.stat().st_size:
         return 0
     return sum(message.topic.endswith("/sample") for message in read_messages(path))

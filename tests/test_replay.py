@@ -31,13 +31,10 @@ from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import mapping_document, recorded_layouts
 from drivelink.recording.mcapfile import recorded_cycles
-from drivelink.recording.outputs import Summary
 from drivelink.recording.playback import open_playback
 from drivelink.recording.recorder import daemon_layouts
 from drivelink.recording.sinks import Sink
-from estimator.online import make_estimator
 from estimator.sample import Estimate, Status
-from estimator.settings import EstimatorSettings
 
 FORMATS = tuple(ending for ending, kind in formats.FORMATS.items() if kind.sink)
 BEGIN_NS = 1_700_000_000_000_000_000
@@ -96,15 +93,6 @@ class Recorded:
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     return Recorded(tmp_path_factory.mktemp("rec"), daemonkit.vsa_text())
-
-
-def test_a_few_cycles_of_many_are_not_called_none_of_them():
-    model = sine.JOINT.model()
-    summary = Summary(1, make_estimator(model, EstimatorSettings(), 1e-3), keep=False)
-    summary.count = 10_000
-    summary._why = {"stale": (3, "no fresh sample has come"), "open": (123, "not revealed")}
-    assert summary.reasons()[0] == "1.2 % of the cycles: not revealed"
-    assert summary.reasons()[1] == "less than 0.1 % of the cycles: no fresh sample has come"
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,8 @@ from rich.console import Console
 from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.jointfile.apply_diagnosis import floor_entry, make_model_monitor
-from drivelink.output import plots, progress, report
-from drivelink.output.document import Grid, Section, show
-from drivelink.output.numbers import Units
-from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
+from drivelink.output import plots, progress
+from drivelink.output.plots import PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
 from drivelink.output.progress import Meter
 from estimator.sample import Record
 
@@ -69,15 +67,6 @@ def test_the_written_joint_file_knows_the_effect_and_its_floor(folder, name, eff
     assert _diagnose(folder, name, better)["verdict"] == "sufficient"
 
 
-@pytest.mark.slow  # what is found is tested in test_diagnosis
-def test_an_unlisted_effect_comes_with_its_curve(folder):
-    effect = _diagnose(folder, "bump")["effects"][0]
-    assert (effect["name"], effect["location"], effect["coordinates"]) == ("unlisted", "motor", ["position"])
-    assert len(effect["curve"]["position"]) == len(effect["curve"]["torque_nm"]) > 100
-    page = (folder / "bump-joint.toml" / "report.html").read_text(encoding="utf-8")
-    assert "None was chosen: a free curve over position leaves less." in page
-
-
 def test_json_is_pure_and_a_page_without_a_curve_has_no_empty_section(folder, capsys):
     report = _diagnose(folder, "clean", "joint.toml", "--json")
     assert json.loads(capsys.readouterr().out) == report
@@ -86,14 +75,6 @@ def test_json_is_pure_and_a_page_without_a_curve_has_no_empty_section(folder, ca
     assert "<th>probability" not in page and not re.search(
         r"e-\d", page[page.index("Error of") : page.index("<svg")]
     )
-
-
-@pytest.mark.parametrize(("chosen", "said"), [(0.02, True), (0.005, False)])
-def test_the_report_says_why_another_effect_was_not_chosen(chosen, said):
-    rival = SimpleNamespace(name="asymmetric_friction", error_relative=0.01)
-    outcome = SimpleNamespace(train=SimpleNamespace(after_relative=chosen), rivals=[rival])
-    why = "asymmetric friction alone leaves less: an effect with more freedom"
-    assert (why in report._choice_of(outcome, [chosen])) == said
 
 
 def test_the_report_is_self_contained_and_has_the_verdict_units_bands_the_winner_and_what_is_left(folder):
@@ -115,27 +96,6 @@ def test_the_report_is_self_contained_and_has_the_verdict_units_bands_the_winner
     assert re.search(r"<th>k_<wbr>nm_<wbr>rad</th><td>\S+</td><td>\S+</td><td>N·m/rad</td>", page)
 
 
-@pytest.mark.slow
-def test_of_a_linear_axis_the_report_speaks_of_newtons_and_metres(folder):
-    (folder / "slide.toml").write_text(JOINT.replace("[[motor]]", 'axis = "linear"\n[[motor]]', 1))
-    _diagnose(folder, "coulomb", "slide.toml")
-    page = (folder / "coulomb-slide.toml" / "report.html").read_text(encoding="utf-8")
-    assert re.search(r"<th>torque_<wbr>nm</th><td>\S+</td><td>\S+</td><td>N</td>", page)
-    assert re.search(r"<th>k_<wbr>nm_<wbr>rad</th><td>\S+</td><td>\S+</td><td>N/m</td>", page)
-    assert "N·m" not in page and "/ rad" not in page and "m/s" in page
-
-
-@pytest.mark.slow
-def test_a_fitted_joint_file_is_calibrated_and_watched(folder):
-    clean, declared, fitted = (str(folder / name) for name in ("clean.csv", "joint.toml", "healthy.toml"))
-    assert main(["fit", clean, "--joint", declared, "--write", fitted]) == 0
-    joint = jointfile.load(folder / "healthy.toml")
-    # The declared numbers are exact; noise moves them by less than a percent.
-    assert joint.link.dynamics.inertia_kg_m2 == pytest.approx(kit.LINK_INERTIA, rel=0.01)
-    assert make_model_monitor(joint) is not None
-    assert _diagnose(folder, "clean", "healthy.toml")["verdict"] == "sufficient"
-
-
 def test_what_cannot_be_diagnosed_is_one_line(folder, capsys):
     text = (folder / "clean.csv").read_text(encoding="utf-8").splitlines()
     (folder / "short.csv").write_text("\n".join(text[:900]) + "\n", encoding="utf-8")
@@ -144,33 +104,6 @@ def test_what_cannot_be_diagnosed_is_one_line(folder, capsys):
     error = capsys.readouterr().err
     assert "too short" in error
     assert error.count("\n") == 1
-
-
-def test_every_coefficient_of_a_polynomial_has_its_unit():
-    text = Units(linear=False).value("coefficients_nm_rad", tuple(float(k) for k in range(1, 9)), None)
-    units = ["rad", "rad³", "rad⁵", "rad⁷", "rad⁹", "rad¹¹", "rad¹³", "rad¹⁵"]
-    assert text == ", ".join(f"{k} N·m/{unit}" for k, unit in enumerate(units, start=1))
-
-
-@pytest.mark.parametrize("columns", [40, 60, 80])
-def test_a_printed_table_keeps_every_letter_in_a_narrow_terminal(columns):
-    names = ("viscous_damping_nm_s_rad", "coefficients_nm_rad[2]")
-    grid = Grid(
-        ("where they differ most", "at", "of A", "of B"),
-        [(name, "−0.0147 rad/s", "140.00 N·m/rad", "–") for name in names],
-    )
-    console = Console(width=columns, file=io.StringIO(), record=True)
-    show([Section("", [grid])], console)
-    lines = console.export_text().splitlines()
-    first = "".join(line[1:].split("│")[0].strip() for line in lines if line.startswith("│"))
-    assert first == "".join(names) and max(map(len, lines)) <= columns
-
-
-def test_a_title_stands_whole_above_a_small_table():
-    console = Console(width=80, file=io.StringIO(), record=True)
-    title = "Free run, from measured states every 1 s"
-    show([Section(title, [Grid(("a", "b"), [("1", "2")])])], console)
-    assert console.export_text().splitlines()[0] == title
 
 
 def test_a_baseline_that_cannot_be_measured_is_a_warning(caplog):
@@ -186,17 +119,6 @@ def wave(n=20_000):
     t = np.arange(n) * 1e-3
     phi = 0.1 * np.sin(t)
     return t, phi, 100.0 + 3000.0 * phi**2
-
-
-def test_curves_differ_in_line_style_marker_and_lightness_not_only_in_colour():
-    _, (axes,) = new_figure()
-    t, phi, _ = wave(100)
-    over_time(axes, {name: PlotCurve(t, k + phi) for k, name in enumerate("abcdef")}, "y")
-    looks = [(line.get_linestyle(), line.get_marker()) for line in axes.lines]
-    assert len(set(looks)) == len(looks) == 6
-    rgb = [[int(color[i : i + 2], 16) for i in (1, 3, 5)] for color in COLORS[:3]]
-    lightness = sorted(np.array(rgb) @ (0.2126, 0.7152, 0.0722))
-    assert np.diff(lightness).min() > 20
 
 
 def test_scattered_samples_become_one_curve():
@@ -226,15 +148,6 @@ def test_what_is_not_valid_is_a_gap_and_both_plots_share_their_time_axis(tmp_pat
     assert torque.get_xlim() == stiffness.get_xlim() == (t[0], t[-1])
     for axes in figures[0].axes:  # which part of the recording that is, is said
         assert "not valid" in axes.get_legend_handles_labels()[1]
-
-
-def test_thinning_loses_no_peak():
-    t = np.arange(300_000) * 1e-3
-    y = np.zeros_like(t)
-    y[123_456] = 7.0
-    _, (axes,) = new_figure()
-    over_time(axes, {"a": PlotCurve(t, y)}, "y")
-    assert len(axes.lines[0].get_xdata()) < 5000 and max(axes.lines[0].get_ydata()) == 7.0
 
 
 @pytest.mark.parametrize("n", [3000, 300_000])
@@ -268,20 +181,8 @@ def test_what_is_not_finite_or_constant_or_empty_can_be_drawn(tmp_path):
     assert save(figure, tmp_path / "x.png").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("suffix", [".svg", ".png"])
-def test_the_same_data_are_the_same_file(suffix, tmp_path):
-    contents = []
-    for name in ("a", "b"):
-        figure, (axes,) = new_figure("t")
-        t, phi, _ = wave(200)
-        over_time(axes, {"φ": PlotCurve(t, phi)}, "φ / rad")
-        contents.append(save(figure, tmp_path / f"{name}{suffix}").read_bytes())
-    assert contents[0] == contents[1]
-
-
 @pytest.fixture
 def clock(monkeypatch):
-    """Seconds that pass when asked to."""
     made = SimpleNamespace(now_s=100.0, monotonic=lambda: made.now_s)
     monkeypatch.setattr(progress, "time", made)
     return made
@@ -295,15 +196,6 @@ def text(shown):
     return shown.file.getvalue()
 
 
-def test_quick_work_shows_nothing(clock):
-    for terminal in (True, False):
-        shown = console(terminal)
-        with Meter("count", 1000, shown) as meter:
-            for k in range(1000):
-                meter.update(k)
-        assert text(shown) == ""
-
-
 def test_long_work_without_a_terminal_is_a_line_now_and_then(clock):
     shown = console(terminal=False)
     with Meter("fit", 100, shown) as meter:
@@ -312,16 +204,6 @@ def test_long_work_without_a_terminal_is_a_line_now_and_then(clock):
             meter.update(k)
     lines = text(shown).splitlines()
     assert lines[0] == "fit: 16 % after 5 s" and 5 <= len(lines) <= 6
-
-
-def test_progress_says_what_is_being_done(clock):
-    for terminal in (True, False):
-        shown = console(terminal)
-        with Meter("diagnose run.csv", None, shown) as meter:
-            for stage in ("bandwidth", "search"):
-                clock.now_s += 6.0
-                meter.stage(stage)
-        assert "diagnose run.csv (bandwidth)" in text(shown) and "(search)" in text(shown)
 
 
 def test_long_work_on_a_terminal_is_a_bar_that_goes_away_also_where_it_breaks_off(clock):

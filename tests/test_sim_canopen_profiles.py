@@ -8,8 +8,7 @@ from simkit import TRANSCRIPTS, StubRig, play, wired
 from sim.canopen.drive import Cia402Drive, StateMachine
 from sim.canopen.drive import PowerState as P
 from sim.canopen.encoder import Cia406Encoder
-from sim.canopen.profiles import PROFILES, profile
-from sim.errors import SimError
+from sim.canopen.profiles import profile
 from sim.sensors import LinkEncoder
 
 NO_OBJECT, NO_SUBINDEX, READ_ONLY = 0x06020000, 0x06090011, 0x06010002
@@ -146,11 +145,6 @@ def test_a_slow_device_boots_in_its_own_time():
         assert wire.wait(1.4) == []
         assert wire.say("601 40 00 10 00 00 00 00 00") == []
         assert wire.wait(0.2) == ["701 00"]
-
-
-def test_an_unknown_profile_is_one_line_with_the_known_ones():
-    with pytest.raises(SimError, match=rf"expected one of {', '.join(PROFILES)}, got \"acme\""):
-        profile("acme")
 
 
 def device(name, rig):

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from itertools import islice
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from sim.cases import case
 from sim.effects import parse
 from sim.errors import SimError
 from sim.excitation import KINDS, build
-from sim.sensors import DriveHardware, LinkEncoder, noise
+from sim.sensors import DriveHardware, LinkEncoder
 from sim.variation import suitable, with_parameters
 from sim.world import World, record
 
@@ -236,12 +235,6 @@ def test_the_link_encoder_has_its_counts_zero_and_noise():
     error = (r["link_position_rad"] - r["truth_link_position_rad"]) / step
     assert np.std(error) == pytest.approx(math.hypot(2.0, 1.0 / math.sqrt(12.0)), rel=0.05)
     assert World(sea(), (DRIVE,), encoder).link_counts() == pytest.approx(-65536 * 0.5 / (2 * math.pi), abs=8)
-
-
-def test_noise_is_the_same_for_the_same_seed_and_else_another():
-    assert list(islice(noise((1, 2), 1.0), 5000)) == list(islice(noise((1, 2), 1.0), 5000))
-    assert list(islice(noise((1, 2), 1.0), 5)) != list(islice(noise((2, 2), 1.0), 5))
-    assert list(islice(noise((1,), 0.0), 3)) == [0.0] * 3
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from drivelink.daemon.jointstatus import JointStatus
 from drivelink.daemon.jointwatch import JointWatch
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
@@ -152,14 +151,3 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(events,
     said = "elbow: model alarm: the residual is 3 times its baseline, likely at the transmission"
     assert begun.startswith(said) and "drivelink diagnose" in begun
     assert over == "elbow: the model alarm is over"
-
-
-@pytest.mark.parametrize(("residual_nm", "said"), [(2e-3, "; residual 0.0020 N·m"), (0.0, "")])
-def test_a_run_without_motion_has_no_residual_in_its_last_line(residual_nm, said):
-    nothing = SimpleNamespace(total=lambda: None)
-    pipeline = SimpleNamespace(
-        missed=0, estimator=SimpleNamespace(residual_nm=residual_nm), model_monitor=None
-    )
-    joint = SimpleNamespace(name="elbow", work=nothing, pipeline=pipeline)
-    status = SimpleNamespace(_loop_joint=joint, _loop=SimpleNamespace(lateness=nothing, overruns=0, cycles=7))
-    assert JointStatus.summary(status) == f"elbow: 7 cycles, 0 missed{said}"

@@ -11,7 +11,6 @@ import pytest
 
 from drivelink.monitor.view import JointView
 from drivelink.monitor.web import snapshot
-from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Status, TransmissionEstimate
 
 NODE = shutil.which("node")
@@ -72,37 +71,6 @@ def test_the_page_shows_numbers_flags_gauge_and_nodes_and_that_the_monitor_has_e
     assert flags == "no connection" and link.startswith("drivelink monitor has ended")
 
 
-def test_undo_stays_on_the_page_when_a_newer_finding_has_come():
-    assert page(
-        """
-        const hidden = (state, undoable) => {
-          showFinding({ finding: { state, sentence: "", cause: "", since: null, recording: "", error: [], details: [] },
-                        acceptable: true, undoable });
-          return document.getElementById("undo").hidden;
-        };
-        return [hidden("proposed", false), hidden("accepted", true), hidden("diagnosing", true)];
-        """
-    ) == [True, False, False]
-
-
-def test_without_a_baseline_no_empty_card_stands_below_what_says_so():
-    bare = fed(document={name: value for name, value in STATUS.items() if name != "residual_alarm"})
-    look = "take(sent[0]); return [$('residualsection').hidden, shown('gauges')];"
-    assert page(look, fed())[0] is False
-    hidden, said = page(look, bare)
-    assert hidden is True, said
-
-
-def test_a_finding_that_proposes_nothing_says_so_in_words():
-    about = page(
-        """
-        showFinding({ finding: { state: "nothing", sentence: "", cause: "asked", since: null, recording: "", error: [], details: [] } });
-        return shown("about");
-        """
-    )
-    assert about == "nothing to accept · asked"
-
-
 def test_the_pointer_reads_the_curve_at_its_place():
     text, moment, hidden, left = page(
         SPAN
@@ -148,16 +116,6 @@ def test_one_wild_value_does_not_flatten_an_axis(wild):
     assert low - high > 0.5 * height  # the sine fills more than half of the plot
 
 
-def test_the_axis_of_the_external_torque_fits_its_band():
-    view = fed()
-    for k in range(4000):
-        torque_nm = 1e-3 * math.sin(2e-3 * k)
-        view.update_external(ExternalMessage(k, k * 1_000_000, 1, torque_nm, 0.01), 1e-3 * k)
-    span = SPAN.replace("torqueplot", "externalplot")
-    low, high, height = page(span + "return [Y(-0.0196), Y(0.0196), B - T];", view)
-    assert 0.7 * height < low - high < height
-
-
 def test_what_is_not_valid_is_shown_grey_with_the_reason_and_sets_no_scale():
     view, one = fed(), (TransmissionEstimate(500.0, 900.0, 1.0, 0.01),)
     for k in range(4000, 6000):
@@ -172,21 +130,6 @@ def test_what_is_not_valid_is_shown_grey_with_the_reason_and_sets_no_scale():
     )
     assert low - high > 0.5 * height and tip.endswith("500.0 N·m\nnot valid")
     assert (title, style) == ("not valid · elbow · drivelink", "past")
-
-
-def test_an_external_torque_that_is_not_valid_has_no_unit():
-    view = fed()
-    view.update_external(ExternalMessage(4000, 4_000_000_000, 0, math.nan, math.nan), 4.0)
-    assert page("take(sent[0]); return [shown('external'), $('externalunit').hidden];", view) == [
-        "not valid",
-        True,
-    ]
-
-
-def test_a_torque_or_deflection_that_passes_zero_does_not_change_its_notation():
-    view, one = fed(), (TransmissionEstimate(2.1e-4, 100.0, 1.0, -3e-6),)
-    view.update(Estimate(4100, 3, 2.1e-4, 100.0, 1.0, one), 4.1)
-    assert page("take(sent[0]); return [shown('torque'), shown('deflection')];", view) == ["0.000", "0.0000"]
 
 
 def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers():

@@ -101,7 +101,6 @@ def until(condition, limit_s: float = LIMIT_S):
 
 @contextmanager
 def process(*arguments: str | Path, **environment: str) -> Iterator[subprocess.Popen[str]]:
-    """A verb of the command line in a process; killed at the end, stopped or not."""
     with python("-m", "drivelink", *arguments, **environment) as running:
         yield running
 
@@ -120,7 +119,6 @@ def python(*arguments: str | Path, **environment: str) -> Iterator[subprocess.Po
 
 
 def script(*arguments: str, name: str = "zenoh_daemon.py") -> AbstractContextManager[subprocess.Popen[str]]:
-    """A Python process of the test."""
     return python(HERE / name, *arguments)
 
 
@@ -149,6 +147,5 @@ def connected(publisher, joint) -> None:
 
 
 def ready(process: subprocess.Popen) -> None:
-    """Wait for the process's word that it is at work."""
     line = process.stdout.readline()
     assert line == "ready\n", (line, process.stderr.read() if process.poll() is not None else "")

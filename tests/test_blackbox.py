@@ -122,7 +122,7 @@ def test_memory_holds_no_more_than_is_kept_and_ten_alarms_a_minute_make_one_reco
 @pytest.mark.parametrize(
     ("status", "cause"),
     [
-        ({"suspected": {"text": "link"}}, "suspected signal"),
+        ({"suspected": {"reason": "frozen", "text": "link"}}, "suspected signal"),
         ({"drive_faults": ["node 1: fault"]}, "drive fault"),
         ({"state": "bus lost"}, "bus lost"),
     ],
@@ -134,6 +134,14 @@ def test_events_of_the_status_are_kept(status, cause, tmp_path):
         scene.box.document("status", json.dumps(status).encode(), 1)
     scene.run(20)
     assert [made[1] for made in scene.finish()] == [cause]
+
+
+def test_a_reading_whose_frames_come_late_is_no_event(tmp_path):
+    scene = Scene(tmp_path)
+    scene.run(20)
+    scene.box.document("status", json.dumps({"suspected": {"reason": "late", "text": "link"}}).encode(), 1)
+    scene.run(20)
+    assert not scene.finish()
 
 
 @pytest.mark.parametrize("asked", [False, True])

@@ -163,3 +163,21 @@ def test_a_drive_that_answers_sdo_without_end_harms_itself_only(made, segment_by
     assert made.status["nodes"]["1"]["missing"] == missing
     made.faults.endless_sdo(made.node(2), -1)
     back(made)
+
+
+def test_a_reading_that_jumps_while_its_frames_come_late_is_late_and_else_it_jumps():
+    with rig() as made:
+        made.run(2500)
+        node = made.node(1)
+        for late in (False, True):
+            if late:
+                made.faults.delay(node, made.tpdo(1)[0], 1)
+                made.run(100)
+            made.faults.misread(node, lambda s: s._replace(position_counts=s.position_counts + 10**5))
+            made.run(3)
+            suspected = made.status["suspected"]
+            assert (suspected["signal"], suspected["motor"]) == ("motor_position", 1)
+            assert suspected["reason"] == ("late" if late else "jumped"), suspected
+            assert ("its frames come late (node 1: frames are missing)" in suspected["text"]) is late
+            made.faults.misread(node, lambda s: s)
+            made.run(2500)

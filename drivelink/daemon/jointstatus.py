@@ -11,7 +11,7 @@ from drivelink.canopen.emcy import emergency_text
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.realtime import RealTime
 from drivelink.cycle.sources import LostSource
-from drivelink.daemon.jointwatch import cross_checks, residual_ratio
+from drivelink.daemon.jointwatch import LATE_FRAMES, cross_checks, residual_ratio
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile
@@ -107,8 +107,7 @@ class JointStatus:
             "residual_nm": loop_joint.pipeline.estimator.residual_nm,
             "residual_alarm": self._alarm(),
             "external": self._external(),
-            "suspected": self._supervisor.contradiction(loop_joint)
-            or loop_joint.pipeline.estimator.suspicion(),
+            "suspected": self._supervisor.contradiction(loop_joint) or self._suspicion(),
             "cross_checks": cross_checks(loop_joint.pipeline.assembler),
             "conditions": sorted(events.active.values()),
             "events": events.recent(),
@@ -159,6 +158,15 @@ class JointStatus:
         pipeline = self._loop_joint.pipeline
         why = None if pipeline.status is None else why_not_valid(pipeline.status, pipeline.estimator)
         return None if why is None else why[1]
+
+    def _suspicion(self) -> dict[str, Any] | None:
+        """Return the reading that the estimator suspects; one that jumps while frames come late is late."""
+        found = self._loop_joint.pipeline.estimator.suspicion()
+        late = next((text for key, text in self._events.active.items() if LATE_FRAMES.match(key)), None)
+        if found is None or found["reason"] != "jumped" or late is None:
+            return found
+        reading = found["text"].partition(":")[0]
+        return {**found, "reason": "late", "text": f"{reading}: its frames come late ({late})"}
 
     def _alarm(self) -> dict[str, Any]:
         monitor = self._loop_joint.pipeline.model_monitor

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -165,6 +166,9 @@ _COUNTED = (  # counter of a node; its smallest reported increase, and the messa
 )
 
 
+LATE_FRAMES = re.compile(
+    r"missing |conflicting |too slow"
+)  # conditions in which a reading may be an older one
 _BUNCHED = (
     "some frames are missing, others come several in one cycle and are not used: "
     "this machine or the bus is too slow for the cycle, or another device has its node id"

@@ -139,7 +139,7 @@ class BlackBox(Sink):
         holding = {
             cause
             for cause, holds in (
-                ("suspected signal", status.get("suspected")),
+                ("suspected signal", (status.get("suspected") or {}).get("reason", "late") != "late"),
                 ("drive fault", status.get("drive_faults")),
                 ("bus lost", status.get("state") == "bus lost"),
             )

@@ -11,6 +11,8 @@ import struct
 import subprocess
 import sys
 import termios
+import time
+from datetime import UTC, datetime
 from typing import NamedTuple
 
 import pytest
@@ -96,6 +98,24 @@ def test_a_view_without_anything_yet_says_so():
     assert "no baseline: drivelink fit" in text and "● observable" in text and "not observable" not in text
 
 
+def test_a_finding_has_its_age_and_that_of_an_earlier_event_says_so():
+    view, now_s = filled(), time.time()
+    view.finding = {
+        "state": "nothing",
+        "sentence": "The model is sufficient.",
+        "time": datetime.fromtimestamp(now_s - 725.0, UTC).isoformat(),
+    }
+    alarm = {"time": now_s - 724.0, "text": "elbow: model alarm: the residual is 3 times its baseline"}
+    view.status = {"residual_alarm": {"active": True}, "events": [alarm]}
+    assert "finding: 12 min ago: The model is sufficient." in view.line()
+    assert any("finding    12 min ago: The model" in line for line in lines(view))
+    alarm["time"] = now_s - 5.0
+    assert "finding: 12 min ago, an earlier event: The model is sufficient." in view.line()
+    assert snapshot(view, True, {})["finding"]["age"] == "12 min ago, an earlier event"
+    view.finding["time"] = "soon"
+    assert "finding: The model is sufficient." in view.line()
+
+
 def test_the_view_shows_what_touches_the_link_where_that_is_known():
     view = filled()
     assert not any(line.startswith("│ external") for line in lines(view))
@@ -108,7 +128,13 @@ def test_the_view_shows_what_touches_the_link_where_that_is_known():
     assert flags(Status.TORQUE_VALID)[2:] == [("torque valid", "green")]
     assert "external 0.50 ± 0.20 N·m" in view.line() and "contact" in view.line()
     view.update_external(ExternalMessage(4000, 4_000_000_000, 0, math.nan, math.nan), 4.0)
-    assert any("not valid" in line for line in lines(view)) and "external not valid" in view.line()
+    (row,) = (line for line in lines(view) if line.startswith("│ external"))
+    assert "not valid" in row and "its filters are settling" in row
+    assert "external not valid (its filters are settling)" in view.line()
+    view.update(Estimate(4001, 0, *[math.nan] * 3, (TransmissionEstimate(*[math.nan] * 4),)), 4.001)
+    view.status = {"not_valid": "the samples cannot be used"}
+    assert "external not valid (as the estimate)" in view.line()
+    assert snapshot(view, True, {})["external_not_valid"] == "the samples cannot be used"
     assert len(view.history.touches) <= 605  # thinned; the begin of a contact is kept
 
 

@@ -71,6 +71,15 @@ def test_the_page_shows_numbers_flags_gauge_and_nodes_and_that_the_monitor_has_e
     assert flags == "no connection" and link.startswith("drivelink monitor has ended")
 
 
+def test_an_error_that_does_not_fall_has_no_two_bars_of_one_length():
+    assert page(
+        """
+        showFinding({ finding: { state: "nothing", sentence: "", cause: "asked", since: null, recording: "", error: [0.1, 0.1], details: [] } });
+        return $("fall").hidden;
+        """
+    )
+
+
 def test_the_pointer_reads_the_curve_at_its_place():
     text, moment, hidden, left = page(
         SPAN

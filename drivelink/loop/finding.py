@@ -215,6 +215,14 @@ def newest(folder: Path, joint: str, *, finished: bool = False) -> tuple[Path, d
     return None
 
 
+def event_s(finding: Mapping[str, Any]) -> float | None:
+    """Return the UNIX time of a finding's event, s; None: it says none."""
+    try:
+        return datetime.fromisoformat(str(finding.get("time"))).timestamp()
+    except (ValueError, OverflowError, OSError):
+        return None
+
+
 def line(finding: Mapping[str, Any]) -> str:
     """Return a finding in one short line for a view; empty without one."""
     state, sentence = finding.get("state"), finding.get("sentence")

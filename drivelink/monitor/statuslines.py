@@ -6,6 +6,7 @@ document. Terminal, web page and plain lines use its result.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
@@ -28,6 +29,8 @@ _WORDS = 200  # characters of one entry
 _GAUGE, _LABEL = 10, 11  # characters
 _NO_BASELINE = "no baseline: drivelink fit --write makes one"
 _SETTLING = "its filters are settling"
+_SPANS = ((86400.0, "days"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
+_SAME_EVENT_S = 2.0  # between an event and its line in the log, at most
 _FULL = 2.0  # times its baseline where a gauge is full
 
 
@@ -214,9 +217,34 @@ def status_text(
     """Return cycle, residual, advice and finding as text, as far as the documents contain them."""
     shown = shape(status, model)
     why = f"not valid: {shown.not_valid}" if shown.not_valid else ""
-    found = _text(findings.line(finding or {}))
+    found = finding_text(finding or {}, shown)
     parts = (_cycle(shown), _cpu(shown), _residual(shown), why, shown.advice, found and f"finding: {found}")
     return " · ".join(part for part in parts if part)
+
+
+def finding_text(finding: Mapping[str, Any], shown: Shown) -> str:
+    """Return a finding in words after its age; empty without one."""
+    found = _text(findings.line(finding))
+    return f"{aged}: {found}" if found and (aged := finding_age(finding, shown)) else found
+
+
+def finding_age(finding: Mapping[str, Any], shown: Shown) -> str:
+    """Return how long ago the event of a finding was, and whether the present alarm is another one."""
+    event_s = findings.event_s(finding)
+    if event_s is None:
+        return ""
+    ago_s = max(0.0, time.time() - event_s)
+    size, unit = next((one for one in _SPANS if ago_s >= 2.0 * one[0]), _SPANS[-1])
+    begun = (event.time_s for event in shown.events if ": model alarm" in event.text)
+    earlier = shown.alarm and event_s + _SAME_EVENT_S < next(begun, 0.0)
+    return f"{ago_s / size:.0f} {unit} ago{', an earlier event' if earlier else ''}"
+
+
+def external_doubt(status: Mapping[str, Any] | None, valid: bool) -> str:
+    """Return why an external torque that is not valid is not, where the estimate is `valid` or not."""
+    if valid:
+        return _SETTLING
+    return shape(status or {}).not_valid or "the estimate is not valid"
 
 
 def _cpu(shown: Shown) -> str:
@@ -253,7 +281,7 @@ def status_lines(
     """Return seven lines at most: cycle, nodes, residual, why not valid, advice, problems, the finding."""
     if not status:
         return []
-    shown, found = shape(status, model), _text(findings.line(finding or {}))
+    shown = shape(status, model)
     advice = shown.advice if len(shown.advice) + _LABEL <= width else _SHORT_ADVICE
     rows: list[tuple[str, list[tuple[str, str]]]] = [
         ("cycle", [(_cycle(shown), "")]),
@@ -262,7 +290,7 @@ def status_lines(
         ("not valid", [(shown.not_valid, "red")]),
         ("look here", [(advice if shown.alarm else "", "bold red")]),
         ("look here", [("; ".join(shown.wrong), "bold red")]),
-        ("finding", [(found, "bold")]),
+        ("finding", [(finding_text(finding or {}, shown), "bold")]),
     ]
     lines = []
     for label, parts in rows:

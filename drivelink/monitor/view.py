@@ -21,7 +21,7 @@ from rich.text import Text
 
 from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import JointHistory, TruePoint, model_curves, usual_range
-from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_lines, status_text
+from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, external_doubt, shape, status_lines, status_text
 from drivelink.output.numbers import among, number, value_and_interval, with_interval
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from estimator.sample import SIGMA_95, Status
@@ -158,7 +158,20 @@ class JointView:
         if touch is None:
             return []
         said = with_interval(touch.torque_nm, SIGMA_95 * touch.std_nm, "N·m") if touch.valid else "not valid"
-        return [f"external {said},"]
+        why = f" ({doubt})" if (doubt := self.external_doubt(True)) else ""
+        return [f"external {said}{why},"]
+
+    def external_doubt(self, brief: bool = False) -> str:
+        """Return why the external torque is not valid; empty: it is, or there is none.
+
+        Args:
+            brief: where the estimate's own reason is said beside it.
+        """
+        touch, estimate = self.history.touch, self.history.latest
+        if touch is None or touch.valid:
+            return ""
+        valid = estimate is not None and bool(estimate.status & Status.VALID)
+        return "as the estimate" if brief and not valid else external_doubt(self.status, valid)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         width = options.max_width
@@ -240,7 +253,7 @@ class JointView:
         table.add_row(
             "external",
             Text.assemble((value, f"bold {ink}"), band),
-            contact,
+            contact if touch.valid else Text(self.external_doubt(True), style="dim"),
             Text(sparkline(series, spark), style=ink),
         )
 

@@ -25,7 +25,7 @@ from drivelink.errors import UsageError, ZenohError
 from drivelink.loop import finding as findings
 from drivelink.loop.acceptance import accepted_at
 from drivelink.monitor.history import Moment, Touch, model_curves
-from drivelink.monitor.statuslines import Shown, shape
+from drivelink.monitor.statuslines import Shown, finding_age, shape
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.webaccept import ACTIONS, WebAcceptance
@@ -161,11 +161,12 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
     touches = [touch for touch in history.touches if last < touch.time_s <= newest]
     if fresh:
         since[view.name] = fresh[-1].time_s
+    shown = shape(view.status or {}, view.model)
     return {
         **_now(view),
         "alive": alive,
-        "status": _describe(shape(view.status, view.model)),
-        "finding": _finding(view.finding),
+        "status": _describe(shown),
+        "finding": _finding(view.finding, shown),
         "restart": last == -math.inf,
         "moments": [_moment(moment) for moment in fresh],
         "residuals": _points(residuals),
@@ -189,6 +190,7 @@ def _now(view: JointView) -> dict[str, Any]:
         "live": view.live and view.history.latest is not None,
         "state": view.state,
         "external": _touch(touch) if touch else None,
+        "external_not_valid": view.external_doubt() or None,
     }
     estimate = view.history.latest
     if estimate is not None:
@@ -251,7 +253,7 @@ def _describe(shown: Shown) -> dict[str, Any]:
     }
 
 
-def _finding(found: Mapping[str, Any]) -> dict[str, Any] | None:
+def _finding(found: Mapping[str, Any], shown: Shown) -> dict[str, Any] | None:
     """Return what the page shows of a finding; None without one."""
     if not findings.line(found):
         return None
@@ -263,6 +265,7 @@ def _finding(found: Mapping[str, Any]) -> dict[str, Any] | None:
     )
     return {
         **texts,
+        "age": finding_age(found, shown),
         "since": found.get("since") if isinstance(found.get("since"), float) else None,
         "details": [str(text) for part in listed if isinstance(part, list) for text in part[:_DETAILS]],
         "error": pair if all(isinstance(value, float) for value in pair) else [],

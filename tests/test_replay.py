@@ -185,6 +185,18 @@ def test_what_a_daemon_reads_back_and_rejects_is_rejected_in_the_replay_at_the_s
     assert [bits(e) for e in recorded.replayed(suffix)] == [bits(e) for e in recorded.live]
 
 
+def test_missing_samples_are_counted_as_those_who_fit_count_them(tmp_path, capsys, caplog):
+    recorded = Recorded(tmp_path, daemonkit.vsa_text(), disturb, formats=(".mcap",))
+    path = tmp_path / "r.mcap"
+    read(path, recorded.joint)
+    (said,) = (line for line in caplog.messages if "samples missing" in line)
+    assert cli.main(["replay", str(path), "--json"]) == 0
+    (out,) = capsys.readouterr().out.splitlines()
+    assert f" {json.loads(out)['samples_missing']} of " in said
+    assert cli.main(["replay", str(path)]) == 0
+    assert said.split(", ")[1] in capsys.readouterr().out
+
+
 def test_what_is_strange_in_a_log_is_said(recorded, tmp_path, caplog):
     lines = (recorded.folder / "r.log").read_text().splitlines(keepends=True)
     strange = tmp_path / "strange.log"

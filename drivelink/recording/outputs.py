@@ -141,19 +141,24 @@ class Summary:
     def __init__(self, motors: int, estimator: Estimator, keep: bool) -> None:
         self._estimator = estimator
         self._why: dict[str, tuple[int, str]] = {}  # by its key: cycles, the last sentence
-        self.count = self.valid = self.observable = 0
+        self.count = self.fresh = self.valid = self.observable = 0
         self._keep = keep
         self._width = len(_columns(motors))
         self._motors = motors
         self._values = array("d")
         self._last: Played | None = None
         self._first_s = 0.0
+        self._sampled: tuple[int, ...] = ()  # number of the first sample, and of the last
 
     def write(self, played: Played) -> None:
         """Count one cycle."""
         if not self.count:
             self._first_s = played.time_s
         self.count += 1
+        if played.tick.fresh:
+            sequence = played.tick.estimate.sequence
+            self._sampled = (self._sampled or (sequence,))[0], sequence
+            self.fresh += 1
         status = played.tick.status
         if status & _VALID:
             self.valid += 1
@@ -171,13 +176,20 @@ class Summary:
         seconds = self._last.time_s - self._first_s
         estimate = self._last.tick.estimate
         half = SIGMA_95 * estimate.stiffness_std_nm_rad
+        missing, periods = self._missing()
+        gaps = f"{missing} of {periods} samples missing, " if missing else ""
         return (
-            f"{self.count} cycles, {seconds:.6g} s, in {took_s:.3g} s "
+            f"{self.count} cycles, {gaps}{seconds:.6g} s, in {took_s:.3g} s "
             f"({seconds / max(took_s, 1e-9):.3g} × real time); "
             f"valid {100 * self.valid / self.count:.1f} %, "
             f"observable {100 * self.observable / self.count:.1f} %; at the end stiffness "
             f"{with_interval(estimate.stiffness_nm_rad, half, 'N·m/rad')}"
         )
+
+    def _missing(self) -> tuple[int, int]:
+        """Return the periods without a sample, of how many from the first to the last one, as `report_gaps`."""
+        periods = self._sampled[-1] - self._sampled[0] + 1 if self._sampled else 0
+        return max(periods - self.fresh, 0), periods
 
     def reasons(self) -> list[str]:
         """Return why cycles are not valid, most frequent first: share of the cycles, last sentence."""
@@ -198,7 +210,12 @@ class Summary:
             for name in ("stiffness_nm_rad", "stiffness_std_nm_rad", "flexibility_torque_nm")
         }
         seconds = self._last.time_s - self._first_s if self._last is not None else 0.0
-        counts = {"cycles": self.count, "valid": self.valid, "observable": self.observable}
+        counts = {
+            "cycles": self.count,
+            "samples_missing": self._missing()[0],
+            "valid": self.valid,
+            "observable": self.observable,
+        }
         why = [{"reason": text, "cycles": count} for count, text in self._sorted()]
         return {"seconds": seconds, **counts, "not_valid": why, "end": end}
 

@@ -187,7 +187,7 @@ class Summary:
         )
 
     def _missing(self) -> tuple[int, int]:
-        """Return the periods without a sample, of how many from the first to the last one, as `report_gaps`."""
+        """Return the periods without a sample, of how many from the first to the last one, as fit counts."""
         periods = self._sampled[-1] - self._sampled[0] + 1 if self._sampled else 0
         return max(periods - self.fresh, 0), periods
 

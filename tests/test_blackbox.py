@@ -158,16 +158,6 @@ def full(*_: object) -> int:
     raise OSError(28, "No space left on device")
 
 
-def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path, monkeypatch, caplog):
-    scene = Scene(tmp_path)
-    scene.run(20)
-    scene.box.keep("asked")
-    monkeypatch.setattr("drivelink.recording.sinks.os.write", full)
-    assert not scene.finish()
-    assert [record.getMessage().count("No space left on device") for record in caplog.records] == [1]
-    assert [path.name for path in (tmp_path / "kept").iterdir()] == ["elbow.day.csv"]
-
-
 def test_what_a_kill_leaves_is_removed_at_the_next_start(tmp_path, monkeypatch):
     scene, left = Scene(tmp_path), tmp_path / "left"
     scene.run(20)

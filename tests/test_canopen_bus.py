@@ -6,7 +6,7 @@ import can
 import pytest
 
 from drivelink.canopen.bus import interface_is_up, open_bus
-from drivelink.canopen.emcy import drive_state, emergency_text, parse_emergency
+from drivelink.canopen.emcy import parse_emergency
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout, bus_load, frame_bits
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection
@@ -74,29 +74,6 @@ def test_every_kind_of_frame_is_counted_at_its_rate():
     expected = 1000 * 65 + 1000 * 135 + 250 * 135 + 100 * frame_bits(2) + 1000 * frame_bits(2) + 10 * 65
     made = load(every, bitrate=500_000, sync_counter_overflow=240)
     assert made.bits_per_s == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(
-    ("of", "code", "text"),
-    [
-        *((emergency_text, *row) for row in (
-            (0x0000, "error reset or no error"), (0x2310, "continuous overcurrent"),
-            (0x2315, "continuous overcurrent"),  # the group it belongs to
-            (0x3210, "DC link overvoltage"), (0x4310, "excess temperature of the drive"),
-            (0x7305, "incremental sensor 1"), (0x8130, "life guard or heartbeat error"),
-            (0x8240, "unexpected SYNC data length"), (0x8611, "following error"),
-            (0x5999, "device hardware"), (0xFF12, "device specific"), (0xA000, "unknown"),
-        )),
-        *((drive_state, *row) for row in (
-            (0x0000, "not ready to switch on"), (0x0250, "switch on disabled"), (0x0231, "ready to switch on"),
-            (0x0233, "switched on"), (0x0637, "operation enabled"),
-            (0x0237, "operation enabled"),  # bit 10 toggles on some drives: no other state
-            (0x0217, "quick stop active"), (0x021F, "fault reaction active"), (0x0218, "fault"),
-        )),
-    ],
-)  # fmt: skip
-def test_error_codes_and_statuswords_have_words(of, code, text):
-    assert of(code) == text
 
 
 def test_an_emcy_is_decoded_with_its_register_and_the_makers_bytes():

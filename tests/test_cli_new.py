@@ -42,14 +42,6 @@ def test_flags_are_what_the_file_says(tmp_path):
     assert joint.bus.sync == "follow"
 
 
-def test_every_line_that_is_commented_out_is_valid_too(tmp_path):
-    """Removing a `#` gives a joint file, not an error."""
-    text = joint_text(Answers(nodes=[3]))
-    for line in text.splitlines():
-        if line.startswith("# ") and " = " in line and "config" not in line and "eds" not in line:
-            jointfile.parse(text.replace(line, line[2:], 1) if "inertia" not in line else text)
-
-
 NEW = [
     *((model, "single") for model in ("polynomial", "linear", "exponential", "vsa-ii", "none")),
     *(("polynomial", arrangement) for arrangement in ("antagonistic", "serial")),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
-import subprocess
 import sys
 from itertools import groupby
 from pathlib import Path
@@ -216,24 +214,6 @@ def test_ctrl_c_while_an_error_is_said_ends_without_a_traceback(monkeypatch, tmp
 
     monkeypatch.setattr(cli, "_fail", pressed)
     assert main(["run", str(tmp_path / "nosuch.toml")]) == 130
-
-
-def complete(script: Path, words: list[str]) -> set[str]:
-    quoted = " ".join(f"'{word}'" for word in words)
-    shell = f"source {script}; COMP_WORDS=({quoted}); COMP_CWORD={len(words) - 1}; _shtab_drivelink; "
-    shell += 'printf "%s\\n" "${COMPREPLY[@]}"'
-    result = subprocess.run(["bash", "-c", shell], capture_output=True, text=True, check=True)
-    return {line.strip() for line in result.stdout.splitlines()}
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
-def test_bash_completes_verbs_options_and_choices(tmp_path, capsys):
-    assert cli.main(["completion", "bash"]) == 0
-    script = tmp_path / "drivelink.bash"
-    script.write_text(capsys.readouterr().out)
-    assert set(cli.VERBS) <= complete(script, ["drivelink", ""])
-    assert "--publish" in complete(script, ["drivelink", "replay", "--"])
-    assert complete(script, ["drivelink", "demo", "--case", ""]) >= {"constant", "quadratic", "vsa-ii"}
 
 
 def test_zsh_has_its_script_and_the_manual_page_every_verb(capsys):

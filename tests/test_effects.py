@@ -112,19 +112,6 @@ def test_a_recording_begins_at_rest_at_its_first_sample_and_orders_end_at_eight(
         StateVariableFilter(2, 0.0, T)
 
 
-@pytest.mark.parametrize(
-    ("effect", "message"),
-    [
-        (Effect(name="friction"), 'effect "friction": expected one of'),
-        (Effect(name="coulomb_friction"), "expected parameter torque_nm"),
-        (Effect(name="coulomb_friction", parameters={"torque_nm": 1.0, "x": 1.0}), "unknown parameter x"),
-    ],
-)
-def test_a_wrong_effect_is_one_line(effect, message):
-    with pytest.raises(EstimatorError, match=message):
-        elements(effect)
-
-
 CURVE = (150.0, 400.0, 9000.0)  # N·m/rad, /rad³, /rad⁵
 HIGHER = tuple(
     Effect(name="higher_order_stiffness", parameters={"coefficient": CURVE[h], "power": 2.0 * h + 1.0})

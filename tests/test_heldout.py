@@ -14,7 +14,7 @@ from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
-from estimator.harm import Unseen, _Figure, harm, harm_of_parts
+from estimator.harm import Unseen, harm, harm_of_parts
 from estimator.identify import identify
 from estimator.model import JointModel, Transmission
 from estimator.model_monitor import measure_baseline
@@ -175,14 +175,6 @@ def test_a_file_that_makes_the_estimator_worse_is_not_written(healthy):
         (model, "do not determine the stiffness of motor 1"),
     ):  # fmt: skip
         assert said in str(harm(model, written, [Unseen.whole(healthy)]))
-
-
-def test_what_is_quoted_is_what_was_judged():
-    """One block that falls outweighs in the mean square the nine that rise."""
-    figure = _Figure(np.array([1.0] * 9 + [100.0]), np.array([4.0] * 9 + [25.0]))
-    assert figure.rises(1e-6)
-    written, declared = figure.roots(1e-6)
-    assert written > declared
 
 
 @pytest.mark.parametrize(("seen", "worse"), [(0.6, True), (0.93, False), (1.0, False)])

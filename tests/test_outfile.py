@@ -236,3 +236,12 @@ def test_fit_brings_its_own_joint_file_up_to_date_in_one_step(files, monkeypatch
         assert cli.main([*arguments, "--force", "--out", str(out), *more]) == 0
         assert "# my own remark" in joint.read_text()
     assert sorted(path.name for path in out.iterdir()) == ["fit.json", "fit.png"]
+
+
+def test_a_result_is_printed_before_a_file_is_written_that_cannot_be(files, capsys):
+    recording, joint = files
+    (recording.parent / "taken").write_text("a file")
+    out = recording.parent / "taken" / "out"
+    assert cli.main(["fit", str(recording), "--joint", str(joint), "--out", str(out)]) != 0
+    said = capsys.readouterr()
+    assert "torque balance" in said.out and "taken" in said.err and said.err.count("\n") == 1

@@ -10,7 +10,7 @@ import pytest
 from onlinekit import PERIOD_S, declared, motion
 
 from estimator import EstimatorError, EstimatorSettings, Sample, Status, make_estimator
-from estimator.reasons import CHANGES, REASONS, reason_text, why_not_valid
+from estimator.reasons import CHANGES, REASONS, why_not_valid
 
 CORE = Path(__file__).parent.parent / "estimator" / "core" / "src"
 
@@ -20,16 +20,6 @@ def test_every_reason_and_change_of_the_core_has_its_words():
     named = set(re.findall(r'Reason::\w+(?:\(_\))? => "(\w+)"', reasons))
     assert named == set(REASONS) - {"stale", "alarm", "contradicted"}
     assert set(re.findall(r'entry\(Cause::\w+, "(\w+)"', causes)) - {"nothing", "noise"} == set(CHANGES)
-
-
-def test_the_sentences_are_those_of_the_documentation():
-    assert reason_text("imprecise", share=0.44, asked=0.2) == "stiffness known to ± 44 %, asked for ± 20 %"
-    assert (
-        reason_text("imprecise", share=0.2004, asked=0.2) == "stiffness known to ± 20.04 %, asked for ± 20 %"
-    )
-    text = reason_text("changed", motor=2, changes=["torque_scale", "stiffness"])
-    assert text == "motor 2: torque gain or stiffness has changed"
-    assert reason_text("changed") == "the joint has changed"
 
 
 @pytest.mark.parametrize("limit", [0.0, -0.1, 1.5, float("nan")])

@@ -34,7 +34,7 @@ MAP = [
 ]
 
 
-def motion(n: int = 5000) -> np.ndarray:
+def motion(n: int = 2500) -> np.ndarray:
     """(n, 4) time, motor position, torque, link position of a sprung joint: 150 N·m/rad, two tones."""
     t = np.arange(n) * 0.002
     rates = np.array([[3.0], [7.1]])
@@ -45,7 +45,7 @@ def motion(n: int = 5000) -> np.ndarray:
     return np.column_stack((t, theta, 0.125 * push + 0.8 * speed - 150.0 * (q - theta), q))
 
 
-def ours(path: Path, n: int = 5000, nan_row: int | None = None) -> Path:
+def ours(path: Path, n: int = 2500, nan_row: int | None = None) -> Path:
     header, table = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad", motion(n)
     if nan_row is not None:
         table[nan_row, 1] = np.nan

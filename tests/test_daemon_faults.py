@@ -8,7 +8,7 @@ from daemonkit import DaemonRig, Listener, rig, vsa
 
 from estimator.sample import Estimate, Status
 
-ENOUGH = 3000  # cycles; every way back takes less
+ENOUGH = 1500  # cycles of 2 ms; every way back takes less
 SOON = 100
 
 
@@ -24,7 +24,7 @@ def valid(estimates: list[Estimate]) -> list[bool]:
 @pytest.fixture(scope="module")
 def settled() -> Iterator[DaemonRig]:
     """Past the estimator's start, for one fault after the other."""
-    with rig() as one:
+    with rig(vsa(bus="period_s = 0.002")) as one:
         yield one
 
 
@@ -88,7 +88,7 @@ def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(made
     heartbeat.restart()
     if not able:
         monkeypatch.setattr(heartbeat._period, "changed", lambda: None)
-    made.run(2 * ENOUGH if able else 8000 + ENOUGH)
+    made.run(2 * ENOUGH if able else 4000 + ENOUGH)
     said = [text for text in made.events if text.startswith("node 2")]
     assert sum("is configured again" in text for text in said) == 1
     assert (said[-1] == "node 2: heartbeat is back") == able
@@ -98,7 +98,7 @@ def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(made
 def test_a_second_reboot_begins_the_configuration_anew_and_what_goes_wrong_in_it_is_that_nodes_own(
     made, monkeypatch
 ):
-    made.run(2000)  # enough is learned to hold blocks after a reboot against
+    made.run(1000)  # enough is learned to hold blocks after a reboot against
     before = made.status["nodes"]["2"]["reboots"]
     made.faults.reboot(made.node(2))
     for _ in range(3):
@@ -113,7 +113,7 @@ def test_a_second_reboot_begins_the_configuration_anew_and_what_goes_wrong_in_it
 
     monkeypatch.setattr("drivelink.canopen.node.offer", broken)
     made.faults.reboot(made.node(1))
-    assert len(made.run(1500)) >= 1499  # a cycle that lacks a frame is concluded with the next SYNC
+    assert len(made.run(750)) >= 749  # a cycle that lacks a frame is concluded with the next SYNC
     said = "node 1 cannot be configured: node 1: OverflowError in its configuration: int too large"
     assert said in " ".join(made.events)
     monkeypatch.undo()
@@ -137,18 +137,18 @@ def bunches(made: DaemonRig, listener: Listener, count: int) -> list[str]:
 def test_frames_in_bunches_are_no_second_device_and_stopped_nodes_are_woken_before_they_are_asked(made):
     listener = Listener(made.joint)
     assert bunches(made, listener, 10) == []
-    made.run(1500)
+    made.run(750)
     assert not [event for event in made.events if "used" in event]
-    (said,) = bunches(made, listener, 150)  # 1.5 s of it
+    (said,) = bunches(made, listener, 75)  # 1.5 s of it
     assert said.startswith("node 2: some frames are missing, others come several in one cycle")
-    made.run(1500)
+    made.run(750)
     assert not made.status["conditions"]
     # Nodes that somebody stopped are woken before they are asked.
     listener.send(0x000, b"\x02\x00")
-    back = next(k for k, e in enumerate(made.run(3000)[100:]) if not e.status & Status.STALE)
+    back = next(k for k, e in enumerate(made.run(1500)[50:]) if not e.status & Status.STALE)
     listener.close()
     # Silence of half a second, and no SDO timeout (0.2 s each time) for any of the three.
-    assert back < 800
+    assert back < 400
 
 
 @pytest.mark.parametrize("segment_bytes", [7, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 1))])
@@ -156,7 +156,7 @@ def test_a_drive_that_answers_sdo_without_end_harms_itself_only(made, segment_by
     missing = made.status["nodes"]["1"]["missing"]
     made.faults.endless_sdo(made.node(2), segment_bytes)
     made.faults.reboot(made.node(2))
-    made.run(6000)
+    made.run(3000)
     cannot = [text for text in made.events if text.startswith("node 2 cannot be configured: ")]
     assert cannot
     assert len(made.run(100)) == 100  # the loop goes on, and says that these are stale

@@ -11,7 +11,7 @@ from drivelink.canopen.layout import Signal
 from drivelink.recording.canframes import FrameLog
 from estimator.sample import Status
 
-OFTEN, ROUND = "read_back_s = 0.02", 2000  # cycles: a round of all objects then, and more
+OFTEN, ROUND = "read_back_s = 0.02\nperiod_s = 0.002", 1000  # cycles: a round of all objects then, and more
 CONFIRMED = 2500  # cycles: every object of three nodes has been asked for once
 
 
@@ -68,7 +68,7 @@ def test_nothing_is_asked_while_somebody_else_talks_to_a_node_or_where_it_is_not
         made.run(ROUND)
         sent, other = uploads(made), Listener(made.joint)
         other.send(0x602, bytes.fromhex("4000100000000000"))
-        made.run(2500)
+        made.run(1250)
         other.close()
         assert len(sent) <= 1  # what was under way
     with rig(vsa(bus="read_back_s = 0")) as made:
@@ -132,7 +132,7 @@ def test_a_frame_that_carries_another_object_than_is_mapped_is_contradicted_unti
         with carrying(made, 1, lambda data: struct.pack("<i", next(other)) + data[4:]):
             made.run(ROUND)
             assert any("as 0x6064:00, by SDO it is" in text for text in made.events)
-            last = made.run(1000)
+            last = made.run(500)
             assert all(e.status & Status.CONTRADICTED and not e.status & Status.VALID for e in last)
             suspected = made.status["suspected"]
         assert (suspected["signal"], suspected["motor"]) == ("motor_position", 1)
@@ -145,13 +145,13 @@ def test_a_log_in_which_a_unit_changes_gives_the_samples_of_the_run(tmp_path):
     joint, path = vsa(bus=OFTEN), tmp_path / "run.log"
     listener = Listener(joint)
     with rig(joint) as made, path.open("w") as log:
-        for k in range(4500):
-            if k == 1500:
+        for k in range(2250):
+            if k == 750:
                 entry = made.node(1).dictionary.find(0x6076, 0)
                 entry.value = 2 * entry.value
             made.run(1)
             log.writelines(
-                f"({1 + k * 1e-3:.6f}) vcan0 {i:03X}#{data.hex()}\n" for i, data in listener.frames()
+                f"({1 + k * 2e-3:.6f}) vcan0 {i:03X}#{data.hex()}\n" for i, data in listener.frames()
             )
         assert any("0x6076:00 was" in text for text in made.events)
         live = [sample for sample, _ in made.collector.samples]

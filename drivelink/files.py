@@ -51,11 +51,15 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 
 
-def check_target(path: Path, inputs: Iterable[Path] = (), *, force: bool = False) -> None:
+def check_target(
+    path: Path, inputs: Iterable[Path] = (), *, force: bool = False, makes_folder: bool = False
+) -> None:
     """Check an output path before any work is done for it.
 
     Args:
         inputs: input files; symbolic and hard links count as the same file.
+        force: whether it may take the place of another file.
+        makes_folder: whether its folder is made where there is none.
 
     Raises:
         UsageError: it is an input or a folder, it exists, or its folder is none.
@@ -67,6 +71,8 @@ def check_target(path: Path, inputs: Iterable[Path] = (), *, force: bool = False
         raise UsageError(f"{path}: expected the name of a file, got a folder")
     if path.parent.exists() and not path.parent.is_dir():
         raise UsageError(f"{path.parent}: expected a folder, got a file")
+    if not makes_folder and not path.parent.exists():
+        raise UsageError(f"{path}: there is no folder {path.parent}")
     if not force and path.is_file():
         raise UsageError(f"{path}: exists already; --force replaces it")
 

@@ -77,7 +77,8 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(verb, arguments, tmp_path
         (["fit", "r.csv", "--joint", "elbow.toml", "--out", "there.toml"], 2, "there.toml: expected a folder, got a file"),
         (["compare", "elbow.toml", "elbow.toml", "--out", "there.toml"], 2, "there.toml: expected a folder, got a file"),
         (["record", "elbow.toml", "--out", "r.xyz"], 3, "expected a name that ends in .mcap"),
-        (["record", "elbow.toml", "--out", "none/r.csv"], 3, "cannot be written"),
+        (["record", "elbow.toml", "--out", "none/r.csv"], 2, "there is no folder none"),
+        (["new", "none/a.toml", "--case", "constant"], 2, "there is no folder none"),
         (["record", "elbow.toml", "--out", "r.log"], 2, 'bus.interface = "virtual" exists inside one process'),
         (["service", "install", "elbow.toml", "--root", "stage"], 2, "lives inside one process"),
         (["service", "install", "dots.toml", "--root", "stage"], 2, "expected the name of a network interface"),
@@ -174,6 +175,11 @@ def test_a_console_without_unicode_gets_the_words_spelt_out(tmp_path, monkeypatc
     assert "N*m rms left" in said and "?" not in said
     for drawn, table in groupby(said.splitlines(), lambda line: line.startswith(("|", "+"))):
         assert not drawn or len({len(line) for line in table}) == 1
+
+
+def test_a_misspelt_verb_has_the_one_that_is_meant(capsys):
+    assert main(["moniter"]) == 2
+    assert capsys.readouterr().err == "drivelink: there is no verb 'moniter': did you mean monitor?\n"
 
 
 def test_a_joint_s_name_is_not_its_file(capsys, monkeypatch):

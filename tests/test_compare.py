@@ -90,7 +90,11 @@ def test_the_verb_writes_a_page_and_numbers(runs, capsys):
     bare = runs / "bare.toml"  # what is missing in a joint file is not said of the recording
     bare.write_text(re.sub(r"\[motor.transmission.parameters\]\n.*\n", "", ELBOW.read_text(encoding="utf-8")))
     assert cli.main(["compare", str(bare), healthy]) == 3
-    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("drivelink")]
+    assert cli.main(["compare", str(bare), str(ELBOW)]) == 0
+    out, err = capsys.readouterr()
+    (row,) = (line for line in out.splitlines() if "stiffness" in line)
+    assert "│ not known │   known │" in row
+    errors = [line for line in err.splitlines() if line.startswith("drivelink")]
     assert len(errors) == 3 and "expected a number above 0" in errors[0]
     assert errors[2].startswith(
         f"drivelink compare: {bare}, over {healthy}: transmission.parameters: expected"

@@ -19,6 +19,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from difflib import get_close_matches
 from itertools import groupby
 from pathlib import Path
 from types import FrameType
@@ -158,6 +159,8 @@ def _main(argv: list[str] | None) -> int:
         if not argv:
             make_parser([]).print_help(sys.stderr)
             return UsageError.exit_status
+        if not verb and (like := get_close_matches(argv[0], VERBS, 1)):
+            raise UsageError(f"there is no verb {argv[0]!r}: did you mean {like[0]}?")
         parser = make_parser([verb])
         args, unknown = parser.parse_known_args(argv)
         if unknown:  # argparse itself would show the usage of the whole program
@@ -351,5 +354,5 @@ def _instead_of_a_name(error: DrivelinkError) -> str:
 
 
 def _fail(verb: str, error: object, status: int) -> int:
-    print(f"drivelink {verb}: {clean_text(' '.join(str(error).split()))}", file=sys.stderr)
+    print(f"{f'drivelink {verb}'.rstrip()}: {clean_text(' '.join(str(error).split()))}", file=sys.stderr)
     return status

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         if not path.exists():
             raise RecordingError(f"{path}: no such file")
     if args.out is not None:
-        check_target(args.out / "comparison.json", (args.a, args.b), force=True)
+        check_target(args.out / "comparison.json", (args.a, args.b), force=True, makes_folder=True)
     from drivelink.comparison import compare  # takes a second; the arguments are checked
     from drivelink.output.document import Paragraph, Section, page, write
 

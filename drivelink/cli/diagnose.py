@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         for path in (args.motion, args.motion.with_suffix(".png")):
             check_target(path, inputs, force=args.force)
     for name in ("report.json", "report.html"):
-        check_target(args.out / name, inputs, force=True)
+        check_target(args.out / name, inputs, force=True, makes_folder=True)
     with Meter(f"diagnose {', '.join(path.name for path in args.recording)}") as meter:
         found = analysis.diagnose(
             args.recording,

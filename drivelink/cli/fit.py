@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     inputs = [*args.recording, *([args.joint] if args.joint else [])]
     for target in (args.out and args.out / "fit.json", folder and folder / "fit.png"):
         if target is not None:
-            check_target(target, inputs, force=True)
+            check_target(target, inputs, force=True, makes_folder=True)
     joint_of(args.recording[0], args.joint)
     _fit(args, folder)
     return 0

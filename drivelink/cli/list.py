@@ -7,6 +7,7 @@ import json
 import sys
 
 from drivelink.cli.monitor import add_zenoh
+from drivelink.errors import ZenohError
 from drivelink.pubsub.clientbase import joints
 from drivelink.pubsub.session import ENDPOINT
 
@@ -24,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the names; return 1 where there is none."""
+    """Print the names; where there is none, that is a failure of zenoh's."""
     endpoint = args.endpoint or ENDPOINT
     names = joints(endpoint=endpoint, config=args.config, prefix=args.prefix or "drivelink")
     if args.json:
@@ -36,4 +37,4 @@ def run(args: argparse.Namespace) -> int:
         print(
             f"no joint{of} at {args.config or endpoint}: drivelink run JOINT starts a daemon", file=sys.stderr
         )
-    return 0 if names else 1
+    return 0 if names else ZenohError.exit_status

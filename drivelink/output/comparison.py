@@ -157,6 +157,12 @@ class Comparison:
             if (f"motor {one.motor}",) not in rows:
                 rows.append((f"motor {one.motor}",))
             rows.append((one.kind, unit, a, b, at, apart))
+        for motor in range(len(self.sides[0].model.motors)):
+            known = [letter for letter, _ in self.curves(motor)["stiffness"]]
+            if len(known) < 2 and all(side.model.motors[motor].flexible for side in self.sides):
+                each = ["known" if letter in known else "not known" for letter in "AB"]
+                rows += [(f"motor {motor + 1}",)] if (f"motor {motor + 1}",) not in rows else []
+                rows.insert(rows.index((f"motor {motor + 1}",)) + 1, ("stiffness", "", *each, "", ""))
         return Grid(("", "unit", "A", "B", "at", "apart"), rows)
 
     def _over(self, side: Side, runs: Sequence[FreeRun]) -> Figure:

@@ -6,7 +6,6 @@ import asyncio
 import json
 import struct
 
-import aiohttp
 import pytest
 from zenohkit import free_endpoint, joint_text, process, ready, script
 
@@ -15,6 +14,8 @@ pytest.importorskip("foxglove", reason="needs the extra foxglove")
 
 async def listened(port):
     """The channel of the estimates, and the first message on it."""
+    import aiohttp  # takes most of a second
+
     protocol, topic = ("foxglove.sdk.v1",), "/elbow/estimate"
     async with (
         aiohttp.ClientSession() as session,

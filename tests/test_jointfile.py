@@ -204,7 +204,7 @@ def test_a_written_file_may_be_edited_and_that_is_said(written, caplog):
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("\n".join(f"key{k} = 1" for k in range(1_000_000)), "at most 256 KiB, got more"),
+        ("key = 1\n" * 1_000_000, "at most 256 KiB, got more"),
         ("# " + "-" * 120_000, "line 1: expected at most 4 KiB, got 120002 letters"),
         ("a = [\n" + "[\n" * 100_000, "nested without end"),
         (".".join("a" * 2_000) + " = 1", "nested without end"),

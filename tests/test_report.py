@@ -27,10 +27,8 @@ JOINT = fleetkit.JOINT.format(name="elbow")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("diagnose")
-    effects = [{}, {"coulomb_nm": 0.4}, {"late_s": 0.004}, {"bump_nm": 1.0}]
-    for name, record in zip(
-        ("clean", "coulomb", "late", "bump"), kit.World(effects, seconds=8.0).run(), strict=True
-    ):
+    effects = [{}, {"coulomb_nm": 0.4}, {"late_s": 0.004}]
+    for name, record in zip(("clean", "coulomb", "late"), kit.World(effects, seconds=8.0).run(), strict=True):
         joints.write_csv(record, folder / f"{name}.csv", 9)
     (folder / "joint.toml").write_text(JOINT, encoding="utf-8")
     return folder

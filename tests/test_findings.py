@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +12,11 @@ import diagnosiskit as kit
 import joints
 import numpy as np
 import pytest
+from rich.console import Console
 
+from drivelink.output.document import as_text, show
+from drivelink.output.numbers import Units
+from drivelink.output.report import sections
 from drivelink.output.sentences import sentence
 from estimator import fit
 from estimator.choices import choice
@@ -19,6 +25,7 @@ from estimator.diagnosis.curves import _bases
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.order import bends
 from estimator.diagnosis.problem import Problem
+from estimator.diagnosis.result import Rival
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.verdict import Judge, _Judged
 from estimator.identify import identify
@@ -54,6 +61,23 @@ TWIN = {"alternatives": ("motor_inertia",), "alternative_probabilities": (0.4,)}
 )  # fmt: skip
 def test_an_effect_is_said_as_surely_as_it_is_known(effects, said):
     assert sentence(outcome(*effects, advice=("move faster",))).startswith(said)
+
+
+def test_a_report_says_once_what_is_alike_and_breaks_no_number_in_40_columns():
+    rivals = tuple(Rival(f"effect_{k}", "motor", 0, 0.1 if k else 0.05) for k in range(8))
+    one = replace(
+        outcome(finding("cogging", 0.9)),
+        rivals=rivals, train=Errors(0.0027, 1.269e-4, 0.12, 0.0056),
+    )  # fmt: skip
+    one.effects[0].parameters["phase_rad"], one.effects[0].std["phase_rad"] = 0.0, 460.0
+    told = sections(one, Units(linear=False))
+    wide = as_text(told)
+    assert "effect 1 " in wide and "and 6 more" in wide and "effect 2 " not in wide
+    assert "0.002700 N·m, 12.00 %" in wide and "0.000127 N·m, 0.56 %" in wide
+    assert re.search(r"phase_rad +│ not determined", wide)
+    narrow = io.StringIO()
+    show(told, Console(file=narrow, width=40))
+    assert "0.002700 N·m, 12.00 %" in narrow.getvalue()
 
 
 def test_a_free_curve_that_raises_the_error_is_not_said_to_explain_it():

@@ -129,9 +129,17 @@ def _plain(text: str) -> str:
     return "\n".join(map(clean_text, text.split("\n")))
 
 
-def _printed(grid: Grid, console: Console) -> Table:
+def _printed(grid: Grid, console: Console) -> Table | Text:
     encoding = console.encoding
-    body = [[_text(row[k]) for row in grid.rows if len(row) > 1] for k in range(len(grid.head))]
+    words = [
+        max(len(word) for cell in (head, *(cell_text(row[k]) for row in grid.rows if len(row) > 1))
+            for word in (cell.split() or [""]))
+        for k, head in enumerate(grid.head)
+    ]  # fmt: skip
+    words[0] = min(words[0], _NARROWEST)  # a name may break
+    if sum(words) + 3 * len(words) + 1 > console.width:
+        return Text(spelt(_plain(_listed(grid)), encoding))
+    body = [[cell_text(row[k]) for row in grid.rows if len(row) > 1] for k in range(len(grid.head))]
     widths = [max(map(len, cells), default=0) for cells in body]
     crowded = sum(max(pair) + 3 for pair in zip(widths, map(len, grid.head), strict=True)) >= console.width
     table = Table()
@@ -145,13 +153,24 @@ def _printed(grid: Grid, console: Console) -> Table:
             justify="left" if left else "right",
             overflow="fold",
             no_wrap=k > 0 and room,
+            min_width=words[k],
         )
     for row in grid.rows:
         if len(row) == 1:
             table.add_section()
-        style = "bold" if len(row) == 1 or _text(row[0]).startswith("▶") else ""
-        table.add_row(*(Text(spelt(_plain(_text(cell)), encoding)) for cell in row), style=style)
+        style = "bold" if len(row) == 1 or cell_text(row[0]).startswith("▶") else ""
+        table.add_row(*(Text(spelt(_plain(cell_text(cell)), encoding)) for cell in row), style=style)
     return table
+
+
+def _listed(grid: Grid) -> str:
+    """Return a table as a list, for where a column would break within a number."""
+    lines = []
+    for row in grid.rows:
+        lines.append(cell_text(row[0]))
+        cells = zip(grid.head[1:], map(cell_text, row[1:]), strict=False)
+        lines += [f"  {head}: {cell}" if head else f"  {cell}" for head, cell in cells if cell]
+    return "\n".join(lines)
 
 
 def write(folder: Path, stem: str, content: Mapping[str, Any], html: str) -> list[Path]:
@@ -208,11 +227,11 @@ def _table(grid: Grid) -> str:
 
 def _row(cells: tuple[Cell, ...], columns: int) -> str:
     if len(cells) == 1:
-        return f'<tr class="over"><th colspan="{columns}">{_escaped(_text(cells[0]))}</th></tr>'
+        return f'<tr class="over"><th colspan="{columns}">{_escaped(cell_text(cells[0]))}</th></tr>'
     first, *rest = cells
     drawn = "".join(map(_cell, rest))
-    kind = ' class="chosen"' if _text(first).startswith("▶") else ""
-    name = _escaped(_text(first)).replace("_", "_<wbr>")
+    kind = ' class="chosen"' if cell_text(first).startswith("▶") else ""
+    name = _escaped(cell_text(first)).replace("_", "_<wbr>")
     return f"<tr{kind}><th>{name}</th>{drawn}</tr>"
 
 
@@ -227,5 +246,6 @@ def _escaped(text: str) -> str:
     return markup.escape(text, quote=False)
 
 
-def _text(cell: Cell) -> str:
+def cell_text(cell: Cell) -> str:
+    """Return what a cell says."""
     return cell if isinstance(cell, str) else getattr(cell, "text", "")

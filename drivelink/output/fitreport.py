@@ -15,7 +15,7 @@ from drivelink.jointfile import JointFile, effect_entry, link_entry
 from drivelink.output import plots
 from drivelink.output.comparison import fits, fits_json
 from drivelink.output.document import PARAMETER_HEAD, Grid, Lines, Rows, Section, parameter_rows
-from drivelink.output.numbers import Units, bare_name, number
+from drivelink.output.numbers import Units, among, bare_name, number
 from estimator.batch import TransmissionFit
 from estimator.freerun import FreeRun
 from estimator.identify import Identified
@@ -104,8 +104,9 @@ def sections(
     made.append(Section("", [Lines(tuple(found.notes))]))
     if len(names) > 1:
         unit = units.shown("N·m")
+        most = max(left.rms_nm for one in found.recordings for left in one)
         each: Rows = [
-            (name, *(f"{number(left.rms_nm, 3)} {unit}  {percent(left.relative, 2)}" for left in one))
+            (name, *(f"{among(left.rms_nm, most, 3)} {unit}  {percent(left.relative, 2)}" for left in one))
             for name, one in zip(names, found.recordings, strict=True)
         ]
         made.append(Section("error of the torque balance", [Grid(("recording", "fitted", "left out"), each)]))

@@ -140,6 +140,9 @@ class Units:
             power = str(2 * k + 1).translate(_RAISED) if k and unit.endswith(f"/{length}") else ""
             half = None if s is None else SIGMA_95 * s
             text, half_text = value_and_interval(x, half)
+            if name.endswith("phase_rad") and half is not None and half >= math.pi:
+                found.append(("not determined", "", ""))  # anywhere on the circle
+                continue
             plain = f"{x:.5g}"
             if not half_text and "e" not in plain:
                 text = plain.replace("-", "−")

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,10 +25,11 @@ from drivelink.output.document import (
     Rows,
     Section,
     Share,
+    cell_text,
     page,
     parameter_rows,
 )
-from drivelink.output.numbers import Units, in_words, number
+from drivelink.output.numbers import Units, among, in_words
 from drivelink.output.sentences import SURE, free_curve, others_of, sentence, title_of, unexplained
 from estimator.choices import choice
 from estimator.diagnosis import Curve, Diagnosis, Finding, StiffnessCurve
@@ -158,8 +160,9 @@ def _errors(outcome: Diagnosis, units: Units) -> Grid:
     unit = units.shown("N·m")
     rows: Rows = []
     for name, one in (("training", outcome.train), ("validation", outcome.validation)):
+        most = max(one.before_rms_nm, one.after_rms_nm)
         before, after = (
-            f"{number(rms)} {unit}, {percent(relative, 2)}"
+            f"{among(rms, most)} {unit}, {percent(relative, 2)}"
             for rms, relative in (
                 (one.before_rms_nm, one.before_relative), (one.after_rms_nm, one.after_relative)
             )
@@ -208,9 +211,18 @@ def _candidates(outcome: Diagnosis) -> list[Block]:
         rows.append((named, *chance, left))
     head = ("candidate", *(("probability",) if chances else ()), "error left with it alone")
     return [
-        Grid(head, rows),
+        Grid(head, _together(rows)),
         Paragraph(_choice_of(outcome, [r.error_relative for r in shown if (r.name, r.motor) in chances])),
     ]
+
+
+def _together(rows: Rows) -> Rows:
+    """Return the rows; of several in a row that leave the same, and are not chosen, the first one."""
+    made: Rows = []
+    for _, group in groupby(rows, lambda row: (str(row[0]).startswith("▶"), *map(cell_text, row[1:]))):
+        first, *others = group
+        made += [first, (f"and {len(others)} more", *first[1:])] if others[1:] else [first, *others]
+    return made
 
 
 def _choice_of(outcome: Diagnosis, chosen: list[float]) -> str:

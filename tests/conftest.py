@@ -40,7 +40,7 @@ hypothesis.settings.load_profile("drivelink")
 # by themselves, and what they wait for comes late enough beside one worker that only calculates.
 REAL_TIME = {
     "test_cli_run", "test_cli_sim", "test_client", "test_client_examples", "test_controller_processes",
-    "test_daemon", "test_daemon_faults", "test_demo", "test_interfaces", "test_monitor",
+    "test_daemon", "test_demo", "test_interfaces", "test_monitor",
     "test_network_attacks", "test_never_moves", "test_publisher", "test_realtime", "test_recording_recorder",
     "test_ros2", "test_session", "test_session_security", "test_sim_canopen_network", "test_socketcan",
 }  # fmt: skip

@@ -102,16 +102,6 @@ def test_the_verb_writes_a_page_and_numbers(runs, capsys):
     assert "--horizon" not in errors[2]
 
 
-def test_between_gaps_the_error_names_the_horizon_that_fits(runs, capsys):
-    head, *rows = (runs / "healthy.csv").read_text().splitlines()
-    gaps = runs / "gaps.csv"
-    gaps.write_text("\n".join([head, *(row for k, row in enumerate(rows) if k % 1001 < 997)]) + "\n")
-    asked = ["compare", str(ELBOW), str(gaps)]
-    assert cli.main([*asked, "--horizon", "2"]) == 3
-    fits = re.search(r"without gaps of 2 s .*; (--horizon) (\S+) fits between", capsys.readouterr().err)
-    assert fits is not None and cli.main([*asked, *fits.groups()]) == 0
-
-
 PERIOD_S = 0.001
 SPRING = {"k_nm_rad": 8.0}
 FRICTION = Effect(name="coulomb_friction", parameters={"torque_nm": 0.05, "smoothing_rad_s": 1e-3})

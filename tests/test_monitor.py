@@ -181,19 +181,6 @@ def test_no_curve_over_time_goes_on_across_a_gap():
         assert [value for time_s, value in curve if 0.495 < time_s < 2.5] == [None]
 
 
-def test_the_curve_grows_and_keeps_the_latest_value_of_each_place():
-    curve = GrowingCurve()
-    for scale in (1.0, 2.0):
-        for k in range(-500, 501):
-            phi = 1e-3 * k * scale
-            curve.add(phi, scale * 100 + phi, 1.0)
-    curve.add(math.nan, 1.0, 1.0)
-    points = curve.points()
-    assert points[0][0] == pytest.approx(-1.0, rel=0.05) and points[-1][0] == pytest.approx(1.0, rel=0.05)
-    assert points == sorted(points) and 40 < len(points) <= 160
-    assert all(stiffness > 198 for _, stiffness, _ in points)
-
-
 def test_unobservable_estimates_leave_the_curve_as_it_is_and_a_daemon_that_starts_anew_clears_it():
     history = JointHistory()
     history.add(estimate(1, 1), 0.0)

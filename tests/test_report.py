@@ -194,16 +194,6 @@ def text(shown):
     return shown.file.getvalue()
 
 
-def test_long_work_without_a_terminal_is_a_line_now_and_then(clock):
-    shown = console(terminal=False)
-    with Meter("fit", 100, shown) as meter:
-        for k in range(100):
-            clock.now_s += 0.3
-            meter.update(k)
-    lines = text(shown).splitlines()
-    assert lines[0] == "fit: 16 % after 5 s" and 5 <= len(lines) <= 6
-
-
 def test_long_work_on_a_terminal_is_a_bar_that_goes_away_also_where_it_breaks_off(clock):
     shown = console(terminal=True)
     with pytest.raises(KeyboardInterrupt), Meter("fit", 100, shown) as meter:

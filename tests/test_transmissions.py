@@ -32,12 +32,6 @@ def test_arrays_of_any_shape_have_torque_stiffness_and_their_slopes(name, quinti
     assert model.at(0.2, alpha.tolist()) == pytest.approx((torque[1, 1], stiffness[1, 1]), rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ALPHAS)
-def test_parameters_go_over_names_and_back(name):
-    model = MODELS[name]
-    assert model.alpha(model.parameters(ALPHAS[name])) == pytest.approx(ALPHAS[name])
-
-
 def test_a_registered_model_is_checked_and_then_found_by_name(quintic):
     model = transmission_model(Transmission(model=quintic))
     assert model is MODELS[quintic]

@@ -153,6 +153,16 @@ def test_a_drive_without_a_mapping_that_serves_is_one_line(slave, said, monkeypa
         configured(blind, link="[link.encoder]\ncounts_per_rev = 4096")
 
 
+def test_two_tpdos_with_one_identifier_are_distinguished():
+    slave = fixed(drive(), (STATUS,), (), (STATUS, POSITION), (), ())
+    slave.objects.update(tpdo(5, NO_RTR | INVALID | 0x385, 1, STATUS, TORQUE))
+    for subindex in range(9):
+        slave.objects[0x1A04, subindex].writable = False
+    _, layout = configured(slave)
+    assert sorted(frame.number for frame in layout.tpdos) == [3, 5]
+    assert len({frame.cob_id for frame in layout.tpdos}) == 2
+
+
 def test_a_missing_tpdo_is_skipped_and_beside_another_master_the_unused_ones_are_taken():
     slave = drive()
     for key in [key for key in slave.objects if key[0] in (0x1801, 0x1A01)]:

@@ -226,6 +226,15 @@ def test_one_bad_cycle_is_enough(what, reason):
     assert cycle or events[-1][2] == pytest.approx(0.011)
 
 
+def test_torques_stay_within_the_limit():
+    controller, _ = moving(torque_nm=0.01)
+    largest = 0.0
+    for k in range(400, 2000):
+        torques = controller.step(k * 1e-3, Cycle(estimate(k, 0), sample(k)), enabled=True, faulted=False)
+        largest = max(largest, *map(abs, torques))
+    assert largest == 0.01
+
+
 def test_the_process_ends_the_torque_a_deadline_and_a_look_after_the_last_estimate(monkeypatch):
     """By a clock that stands still unless the process waits."""
     controller, _ = moving()

@@ -93,10 +93,15 @@ def test_a_healthy_bus_is_found_healthy_and_nothing_is_written(rig):
     for fix, begin in {
         '[motor.drive] checks = ["current"]': "current (0x6078:00) can be compared with torque",
         '[motor.drive] checks = ["velocity", "current"]': "all of them",
-        "[bus] sync_counter_overflow = 240": "node ",
+        "[bus] sync_counter_overflow = 240": "a SYNC counter ",
         '[motor.drive] second_encoder = "0x60E4:01"': "second encoder (0x60E4:01)",
     }.items():
         assert offered[fix].startswith(begin)
+    out = Console(record=True, width=120)
+    report.show(out)
+    shown = out.export_text()
+    assert shown.count("can be compared with torque") == shown.count("sync_counter_overflow") == 1
+    assert "1 more, as with node 5" in shown
     questions = [(cob_id, data) for cob_id, data in sent if cob_id == 0 or 0x601 <= cob_id <= 0x67F]
     assert len(questions) > 127
     for cob_id, data in questions:  # uploads and their segments only

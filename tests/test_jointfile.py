@@ -211,7 +211,7 @@ def test_a_written_file_may_be_edited_and_that_is_said(written, caplog):
         (".".join("a" * 40) + " = 1", "nested without end"),
         (("# " + "-" * 4_000 + "\n") * 60, "name: expected this key, it is missing"),
         ("name = [" + "'x',\n" * 20_000 + "]", "name: input should be a valid string"),
-        ("\n".join(f"k{k} = 1" for k in range(20_000)), "(and 20001 more)"),
+        ("\n".join(f"k{k} = 1" for k in range(20_000)), "(and 20001 more: motor, k0, k1)"),
     ],
 )
 def test_a_joint_file_that_grows_without_end_is_one_line(tmp_path, text, line):

@@ -71,11 +71,11 @@ def velocity_as_check(available: Available) -> dict[Signal, tuple[MappedObject, 
     return found | {Signal.VELOCITY_CHECK: tuple(replace(o, signal=Signal.VELOCITY_CHECK) for o in velocity)}
 
 
-def report_sync_counter(section: Section, subject: str, bus: BusSection) -> None:
+def report_sync_counter(section: Section, bus: BusSection) -> None:
     """Report a SYNC counter (0x1019) that is off: it shows each lost SYNC."""
     if bus.sync == "produce" and not bus.sync_counter_overflow:
         line = f"[bus] sync_counter_overflow = {_COUNTER}"
-        text = f"{subject} has a SYNC counter (0x1019), which numbers each SYNC in logs: no further frame"
+        text = "a SYNC counter (0x1019) can number each SYNC in logs: no further frame"
         section.info("cross-check", text, line)
 
 

@@ -163,7 +163,7 @@ def _examine_node(
     section.notices += survey.offer.notices
     planned = _judge_mapping(section, role, survey)
     if _has(bus, joint.bus, role.node_id, 0x1019):
-        report_sync_counter(section, subject, joint.bus)
+        report_sync_counter(section, joint.bus)
     return survey, planned
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +13,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from drivelink.notice import Findings, Severity
+from drivelink.notice import Findings, Notice, Severity
 from drivelink.plaintext import spelt
 
 _MARKS = {
@@ -62,11 +64,19 @@ class Report:
         }
 
     def show(self, console: Console) -> None:
-        """Print it."""
+        """Print it; what may be done with several nodes alike stands at the first one."""
+        said: dict[Notice, str] = {}  # and where
         for section in self.sections:
-            if section.notices:
+            notices = [notice for notice in section.notices if notice not in said]
+            again = Counter((n.subject, said[n].lower()) for n in section.notices if n in said)
+            for (subject, where), count in again.items():
+                text = f"{count} more, as with {where}"
+                notices.append(Notice(severity=Severity.INFO, subject=subject, text=text))
+            if notices:
                 console.print(f"[bold]{escape(section.title)}[/bold]", highlight=False)
-                console.print(Padding(_table(section, console.encoding), (0, 0, 1, 1)))
+                console.print(Padding(_table(notices, console.encoding), (0, 0, 1, 1)))
+            offers = (one for one in notices if one.severity is Severity.INFO and one.fix)
+            said |= dict.fromkeys(offers, section.title)
         console.print(self._closing(), highlight=False)
 
     def _closing(self) -> str:
@@ -83,12 +93,12 @@ class Report:
         return f"[green]{self.fine}[/green]"
 
 
-def _table(section: Section, encoding: str) -> Table:
+def _table(notices: Sequence[Notice], encoding: str) -> Table:
     table = Table(box=None, show_header=False, padding=(0, 1), pad_edge=False)
     table.add_column(width=1)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
-    for finding in section.notices:
+    for finding in notices:
         mark, colour = _MARKS[finding.severity]
         text = Text(spelt(finding.text, encoding))
         if finding.fix:

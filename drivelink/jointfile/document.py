@@ -105,6 +105,7 @@ _LOG = logging.getLogger(__name__)
 
 MAX_BYTES = 256 << 10  # of a joint file; the longest that fit and diagnose write have some 10 KiB
 MAX_LINE_BYTES = 4 << 10  # the longest that they write, a baseline, has some 300 bytes
+_OTHERS = 3  # further keys that a message names
 _SHOWN = 80  # characters of a wrong value in a message
 _DEEP = re.compile(r"(?<![\w\"' \t-])(?:[\w\"' \t-]++\.){32}")  # parts of one key, found in linear time
 _NESTED = "expected a joint file, got tables nested without end"
@@ -322,7 +323,8 @@ def _one_line(error: ValidationError) -> str:
         message = f"expected {_PATTERNS[str(first['loc'][-1])]}, got {_shown(first['input'])}"
     elif first["type"] != "value_error":
         message = f"{message[0].lower()}{message[1:]}, got {_shown(first['input'])}"
-    rest = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    others = [_key(problem["loc"]) for problem in problems[1:]]
+    rest = f" (and {len(others)} more: {', '.join(others[:_OTHERS])})" if others else ""
     return f"{key}: {message}{rest}" if key else f"{message}{rest}"
 
 

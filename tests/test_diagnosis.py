@@ -122,6 +122,7 @@ def test_clean_and_everyday_recordings_are_sufficient(case, records):
     assert found.validation.after_relative < 0.01
     if case == "skew":  # within a sample: aligned, and reported
         assert found.alignment["link_position_delay_s"] == pytest.approx(0.0007, abs=5e-5)
+        assert 0.0 < found.alignment_std["link_position_delay_s"] < 5e-5
 
 
 def test_what_is_in_no_library_is_located_and_described_by_a_curve(records):

@@ -92,6 +92,7 @@ def as_json(outcome: Diagnosis, runs: Mapping[str, FreeRun], of: str) -> dict[st
             for one in outcome.recordings
         ],
         "alignment": dict(outcome.alignment),
+        "alignment_std": dict(outcome.alignment_std),
         "candidates": [rival._asdict() for rival in outcome.rivals],
         "advice": list(outcome.advice),
         "notes": list(outcome.notes),
@@ -186,7 +187,7 @@ def _parameters(outcome: Diagnosis, units: Units) -> Grid:
             rows += parameter_rows(name, value, one.std[name], units)
     rows += [("corrected in the readings",)] if outcome.alignment else []
     for name, value in outcome.alignment.items():
-        rows += parameter_rows(name, value, None, units)
+        rows += parameter_rows(name, value, outcome.alignment_std.get(name), units)
     return Grid(PARAMETER_HEAD, rows)
 
 

@@ -157,10 +157,12 @@ def stamped_wrongly(name: str, delay_s: float, period_s: float) -> str | None:
     )
 
 
-def alignment_of(problem: Problem, after: Fitted, effects: list[Finding], surplus: float) -> dict[str, float]:
-    """Return everyday corrections of the readings, by channel."""
+def alignment_of(
+    problem: Problem, after: Fitted, effects: list[Finding], surplus: float
+) -> dict[str, tuple[float, float]]:
+    """Return everyday corrections of the readings with their standard deviations, by channel."""
     named = {(f.name, f.motor) for f in effects}
-    pairs: dict[str, float] = {}
+    pairs: dict[str, tuple[float, float]] = {}
     std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, after, surplus)), 0.0))
     for slot, x, sigma in zip(after.slots, after.posterior.x, std, strict=True):
         value = slot.taken + float(x)
@@ -173,9 +175,9 @@ def alignment_of(problem: Problem, after: Fitted, effects: list[Finding], surplu
         ):
             continue
         if slot.name == "encoder_delay":
-            pairs["link_position_delay_s"] = value
+            pairs["link_position_delay_s"] = value, float(sigma)
         elif slot.name in _CHANNELS:
-            pairs[f"motor{(slot.motor or 0) + 1}_{_CHANNELS[slot.name]}"] = value
+            pairs[f"motor{(slot.motor or 0) + 1}_{_CHANNELS[slot.name]}"] = value, float(sigma)
     return pairs
 
 

@@ -153,6 +153,7 @@ class Diagnosis:
         floor_nm: per motor, residual rms of the augmented model.
         transmissions: per motor, refitted with the effects.
         alignment: corrected skew and offset between channels; names carry the unit.
+        alignment_std: their standard deviations.
         rivals: the candidates' standing, best first.
         curves: one for each effect.
         series: of the first motor, on the training recording.
@@ -171,6 +172,7 @@ class Diagnosis:
     floor_nm: tuple[float, ...]
     transmissions: tuple[Refitted, ...]
     alignment: dict[str, float] = field(default_factory=dict)
+    alignment_std: dict[str, float] = field(default_factory=dict)
     rivals: tuple[Rival, ...] = ()
     curves: tuple[Curve, ...] = ()
     series: Series | None = None

@@ -149,6 +149,7 @@ class Judge:
             unsure = ["no stiffness is reported: what is unexplained is in the spring's torque or deflection"]
         sides = self._sides(before, after) if judged.verdict in ("effect", "unexplained") else []
         notes = [*judged.notes, *unsure, *self._doubts(effects), *sides, *wider(surplus)]
+        aligned = alignment_of(problem, after, effects, surplus)
         return Diagnosis(
             verdict=judged.verdict,
             bandwidth_hz=problem.bandwidth_hz,
@@ -157,7 +158,8 @@ class Judge:
             validation=self.held.errors(before, after),
             floor_nm=tuple(self._floor(after)),
             transmissions=transmissions,
-            alignment=alignment_of(problem, after, effects, surplus),
+            alignment={name: value for name, (value, _) in aligned.items()},
+            alignment_std={name: std for name, (_, std) in aligned.items()},
             rivals=tuple(rivals_of(self.search)),
             curves=curves_of(problem, after),
             series=series_of(problem, before, after),

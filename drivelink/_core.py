@@ -9,13 +9,17 @@ from estimator._core import (
     Assembler,
     History,
     JointPipeline,
+    JsonNumbers,
     LatencyHistogram,
+    McapMessage,
+    McapMessages,
     NodeCounters,
     Tick,
     __version__,
     encode_estimate,
     encode_external,
     encode_sample,
+    json_frame,
 )
 
 __all__ = [
@@ -27,11 +31,15 @@ __all__ = [
     "Assembler",
     "History",
     "JointPipeline",
+    "JsonNumbers",
     "LatencyHistogram",
+    "McapMessage",
+    "McapMessages",
     "NodeCounters",
     "Tick",
     "__version__",
     "encode_estimate",
     "encode_external",
     "encode_sample",
+    "json_frame",
 ]

@@ -37,6 +37,28 @@ def encode_sample(sample: Sample, stamp_ns: int) -> bytes:
         stamp_ns: UNIX time of its SYNC.
     """
 
+def json_frame(data: bytes) -> tuple[int, bytes]:
+    """Identifier and bytes of a message of `/can`.
+
+    Raises:
+        ValueError: it is none.
+    """
+
+class JsonNumbers:
+    """Reads some numbers of messages, which are flat JSON objects.
+
+    Args:
+        names: of their fields.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None: ...
+    def __call__(self, data: bytes) -> tuple[float | None, ...]:
+        """The numbers in the order of their names; NaN for null, None for a field that is not there.
+
+        Raises:
+            ValueError: it is no flat JSON object, or such a field has another value.
+        """
+
 class NodeCounters:
     """What became of one node's frames since the start.
 
@@ -162,6 +184,48 @@ class Assembler:
         Raises:
             DriveError: as in the constructor; then everything is as it was.
         """
+
+class McapMessage:
+    """One message of an MCAP file.
+
+    Attributes:
+        topic: its channel's.
+        log_time_ns: its time.
+        data: its content.
+    """
+
+    @property
+    def topic(self) -> str: ...
+    @property
+    def log_time_ns(self) -> int: ...
+    @property
+    def data(self) -> bytes: ...
+
+class McapMessages:
+    """The messages among the records of an MCAP file, up to a damaged one or a stamp beyond 63 bits.
+
+    Args:
+        topics: last parts of the topics of interest (`sample` for `/elbow/sample`); None: all.
+
+    Attributes:
+        count: records up to here; a sample or an estimate counts twice, as no joint at rest has them in less
+            than twice the bytes of a frame.
+        stamp_ns: of the last message.
+        broken: whether a record was damaged.
+    """
+
+    def __init__(self, topics: frozenset[str] | None) -> None: ...
+    @property
+    def count(self) -> int: ...
+    @property
+    def stamp_ns(self) -> int: ...
+    @property
+    def broken(self) -> bool: ...
+    def take(self, records: bytes, most: int) -> McapMessages:
+        """Go on with further records, and end where there are more than `most` in all."""
+
+    def __iter__(self) -> McapMessages: ...
+    def __next__(self) -> McapMessage: ...
 
 class LatencyHistogram:
     """A distribution of durations: counts per microsecond up to 5 ms, and the maximum.

@@ -7,21 +7,18 @@ configuration in the recording.
 from __future__ import annotations
 
 import logging
-import re
-from binascii import unhexlify
 from collections import deque
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from itertools import chain, islice
 from pathlib import Path
 
-from drivelink._core import SYNC_COB_ID
+from drivelink._core import SYNC_COB_ID, json_frame
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.syncclock import measure_period
 from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
-from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, LoggedFrame, in_order, read_frames
+from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, LoggedFrame, in_order, logged, read_frames
 from drivelink.recording.columns import record_of_samples
 from drivelink.recording.cycles import (
     OF_MAPS,
@@ -34,7 +31,7 @@ from drivelink.recording.cycles import (
 )
 from drivelink.recording.grid import report_gaps
 from drivelink.recording.mapping import recorded_layouts, side_file
-from drivelink.recording.mcapfile import message_fields, read_messages
+from drivelink.recording.mcapfile import read_messages
 from estimator.sample import Record
 
 _LOG = logging.getLogger("drivelink.recording")
@@ -216,28 +213,9 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
     return record
 
 
-_AS_WRITTEN = re.compile(
-    rb'\{"id":(\d{1,4}),"data":"([0-9a-f]*)"\}'
-)  # by drivelink; read as JSON it costs twice as much
-
-
 def _mcap_frames(path: Path) -> Iterator[LoggedFrame]:
-    for topic, stamp_ns, text in read_messages(path, frozenset({"can"})):
+    for message in read_messages(path, frozenset({"can"})):
         try:
-            can_id, data = _frame(text)
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-            raise RecordingError(f"{path}: {topic[:80]} is no frame of drivelink: {error}") from error
-        yield LoggedFrame(stamp_ns, can_id, data, "")
-
-
-@lru_cache(maxsize=256)  # of a joint at rest, the same ones come again and again
-def _frame(text: bytes) -> tuple[int, bytes]:
-    """Identifier and bytes of a message."""
-    if ours := _AS_WRITTEN.fullmatch(text):
-        can_id, data = int(ours[1]), unhexlify(ours[2])
-    else:
-        fields = message_fields(text)
-        can_id, data = int(fields["id"]), bytes.fromhex(fields["data"])
-    if not 0 <= can_id <= 0x7FF or len(data) > 64:
-        raise ValueError("expected an 11-bit identifier and at most 64 bytes")
-    return can_id, data
+            yield logged((message.log_time_ns, *json_frame(message.data), ""))
+        except ValueError as error:
+            raise RecordingError(f"{path}: {message.topic[:80]} is no frame of drivelink: {error}") from error

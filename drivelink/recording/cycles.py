@@ -23,6 +23,7 @@ from estimator.sample import Sample
 
 OF_SDO = range(0x581, 0x680)
 OF_MAPS = frozenset({0, *OF_SDO, *range(0x701, 0x780)})  # NMT, SDO, boot-up
+_FOLLOWED = OF_MAPS | {SYNC_COB_ID}
 
 
 class Cycle(NamedTuple):
@@ -66,7 +67,8 @@ def numbered_ahead(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[N
     """Each SYNC, numbered by later ones, with the frames until the next one."""
     numbering = SyncNumbering(period_s)
     for frame in frames:
-        yield from numbering.push(frame)
+        if found := numbering.push(frame):
+            yield from found
     yield from numbering.rest()
 
 
@@ -78,28 +80,47 @@ class SyncNumbering:
     """
 
     def __init__(self, period_s: float, *, measure: bool = False) -> None:
-        self.period_s = period_s  # in use
         self._measure = measure
         self._last: int | None = None
         self._due_ns: float | None = None
         self._cycles: deque[list[LoggedFrame]] = deque()  # each waiting SYNC and its frames
         self._stamps: deque[int] = deque()  # of these SYNCs
+        self._number = 0  # of the first of them
+        self._earliest: deque[tuple[int, int, int]] = deque()  # see `_await`
+        self._begin(period_s)
 
     def push(self, frame: LoggedFrame) -> Sequence[Numbered]:
         """Process a frame; return what is decided now."""
         cycles = self._cycles
-        if frame.can_id == SYNC_COB_ID:
-            cycles.append([frame])
-            self._stamps.append(frame.stamp_ns)
-            return ((cycles.popleft(), self._jump()),) if len(cycles) > _AHEAD else ()
-        if cycles:
+        if frame[1] != SYNC_COB_ID:
+            if not cycles:
+                return (((frame,), 1),)
             cycles[-1].append(frame)
             return ()
-        return (((frame,), 1),)
+        cycles.append([frame])
+        self._await(frame[0])
+        return ((cycles.popleft(), self._jump()),) if len(cycles) > _AHEAD else ()
 
     def rest(self) -> Sequence[Numbered]:
         """End the stream; return all that waits."""
         return [(self._cycles.popleft(), self._jump()) for _ in range(len(self._cycles))]
+
+    def _begin(self, period_s: float, stamps: Iterable[int] = ()) -> None:
+        """Set the period in use; the SYNCs that wait begin anew with it."""
+        self.period_s, self._step_ns = period_s, round(period_s * 1e9)
+        self._stamps.clear()
+        self._earliest.clear()
+        for stamp in stamps:
+            self._await(stamp)
+
+    def _await(self, stamp: int) -> None:
+        """Add a SYNC; keep lateness, number and stamp of those that no later one is less late than."""
+        number, earliest = self._number + len(self._stamps), self._earliest
+        late = stamp - number * self._step_ns
+        while earliest and earliest[-1][0] > late:
+            earliest.pop()
+        earliest.append((late, number, stamp))
+        self._stamps.append(stamp)
 
     def _jump(self) -> int:
         """Return the jump of the first waiting SYNC."""
@@ -107,24 +128,26 @@ class SyncNumbering:
         if self._measure:
             self._measure = False
             measured = measure_period(list(stamps), self.period_s) if NO_STAMP not in stamps else None
-            self.period_s = self.period_s if measured is None else measured.period_s
+            self._begin(self.period_s if measured is None else measured.period_s, tuple(stamps))
         period_ns = self.period_s * 1e9
         stamp = stamps.popleft()
+        _, number, first = self._earliest[0]
+        ahead = number - self._number  # SYNCs until that one
+        if not ahead:
+            self._earliest.popleft()
+        self._number += 1
         if stamp == NO_STAMP:
             return 1
         due, last, self._last = self._due_ns, self._last, stamp
         if due is None or (last is not None and stamp < last - period_ns):  # the clock was set back
-            earliest = min([float(stamp), *(s - (k + 1) * period_ns for k, s in enumerate(stamps))])
-            self._due_ns = earliest + period_ns
+            self._due_ns = first - ahead * period_ns + period_ns
             return 1
         late = (stamp - due) / period_ns
         if late < _EXTRA:
             return 0
         lost = 0
         if late > 0.5:
-            lost = max(
-                0, round(min([late, *((s - due) / period_ns - (k + 1) for k, s in enumerate(stamps))]))
-            )
+            lost = max(0, round((first - due) / period_ns - ahead))
         left = late - lost
         self._due_ns = due + (1 + lost + (_FOLLOW * left if abs(left) < 0.5 else 0.0)) * period_ns
         return 1 + lost
@@ -158,6 +181,8 @@ class Assembly:
         assembler, feed = self.assembler, self.assembler.feed
         for stamp_ns, can_id, data, _ in frames:
             cycle, sample, is_sync = None, feed(can_id, data, jump), can_id == SYNC_COB_ID
+            if sample is None and can_id not in _FOLLOWED:
+                continue
             if is_sync and jump > 0:
                 self._before_ns, self._stamp_ns = self._stamp_ns, stamp_ns
             if sample is not None:
@@ -166,7 +191,7 @@ class Assembly:
                 self._recent.add(sample)
             elif is_sync and jump and (missed := assembler.missed) >= 0:
                 cycle = Cycle(missed, self._before_ns, None, assembler.flags)
-            if is_sync or can_id in OF_MAPS:  # it is compared with the mapping after its cycle was made
+            if can_id in _FOLLOWED:  # it is compared with the mapping after its cycle was made
                 self.follower.feed(can_id, data, seconds(stamp_ns, assembler.sequence, self._period_s))
             if cycle is not None:
                 yield cycle

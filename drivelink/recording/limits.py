@@ -22,7 +22,7 @@ MAX_BLOCK_BYTES = 64 << 20  # an MCAP chunk or a BLF container, unpacked; tools 
 MAX_UNREAD = 30_000  # messages of one key that wait for a recorder: half a minute at 1 kHz
 _RECORD_BYTES = 3.5  # of a file for each record: a frame of a bus at rest takes 4 in MCAP, 4.8 in BLF
 _FEW_RECORDS = 5000  # that any file may have
-_LAST_STAMP_NS = (1 << 63) - 1  # of the year 2262
+LAST_STAMP_NS = (1 << 63) - 1  # of the year 2262
 
 
 def require_samples(count: int, where: str) -> None:
@@ -54,7 +54,7 @@ def require_stamp(stamp_ns: int, path: Path) -> None:
     Raises:
         RecordingError: it has not.
     """
-    if stamp_ns > _LAST_STAMP_NS:
+    if stamp_ns > LAST_STAMP_NS:
         raise RecordingError(f"{path}: expected stamps below 2^63 ns, got {stamp_ns:.3g}")
 
 

@@ -6,23 +6,23 @@ or a power loss). Record layout: mcap.dev/spec.
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import os
 import struct
 import zlib
 from array import array
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import zstandard
 
+from drivelink._core import JsonNumbers, McapMessage, McapMessages
 from drivelink.errors import RecordingError
 from drivelink.files import open_regular
 from drivelink.jointfile import JointFile
@@ -37,34 +37,21 @@ from drivelink.recording.limits import (
     require_stamp,
     too_many_records,
 )
-from drivelink.recording.messages import read_sample
-from estimator.sample import Record, Status
+from drivelink.recording.messages import measured_names
+from estimator.sample import Record, Sample, Status
 
 _LOG = logging.getLogger("drivelink.recording")
 
 _MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")  # opcode, length of the record
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<QQQII")  # first, last, size, CRC, length of the compression's name
-_CHANNEL_HEAD = struct.Struct("<HHI")  # channel, schema, length of the topic
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
+_FOOTER, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 0x02, 0x04, 0x05, 0x06, 0x0F
 _ATTACHMENT = 0x09
 SNAPSHOT = "estimator"  # name of the attachment from whose state a replay goes on
 _WANTED = frozenset({_CHANNEL, _MESSAGE_OP, _CHUNK_OP})
 _MOST_RATIO = 64  # of unpacked bytes to those of the file: of a joint at rest they are some 30
 _SMALL_BYTES = 16 << 20  # that any file may unpack to
-_OF_NUMBERS = ("/sample", "/estimate")  # count twice: of a joint at rest they have 8 bytes at least
-_MESSAGE_BYTES = 64 << 10  # of a sample, an estimate or a frame: ours have some 500
-_DECODE = json.JSONDecoder().raw_decode  # half of what json.loads costs
 _ZSTD_WINDOW = 128 << 20  # memory limit of its decoder, the same as in zstd's tools
-
-
-class McapMessage(NamedTuple):
-    """One message: topic, time, data."""
-
-    topic: str
-    log_time_ns: int
-    data: bytes
 
 
 def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[McapMessage]:
@@ -76,10 +63,10 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
     Raises:
         RecordingError: it cannot be read, is not an MCAP file, or has a record larger than `MAX_BLOCK_BYTES`.
     """
-    channels: dict[int, str | None] = {}
+    messages = McapMessages(topics)
     with _opened(path) as file:
         size = os.fstat(file.fileno()).st_size
-        unpacked = count = 0
+        unpacked = 0
         try:
             for opcode, record in _records(file, path, _WANTED):
                 records = _decompressed(record[_HEAD.size :], path) if opcode == _CHUNK_OP else record
@@ -88,8 +75,13 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
                     raise RecordingError(
                         f"{path}: expected to unpack to at most {_MOST_RATIO} times its size"
                     )
-                most = most_records(file.tell()) - count
-                count += yield from _messages(records, channels, topics, most, path)
+                most = most_records(file.tell())
+                yield from messages.take(records, most)
+                if messages.count > most:
+                    raise too_many_records(path)
+                require_stamp(messages.stamp_ns, path)
+                if messages.broken:
+                    raise _BrokenError
         except _BrokenError:
             _warn_once(path, path.stat().st_mtime_ns)
 
@@ -154,24 +146,6 @@ def _attached(body: bytes) -> tuple[str, bytes]:
     return texts[0], body[place + 8 : place + 8 + size]
 
 
-def message_fields(data: bytes) -> dict[str, Any]:
-    """Return the fields of a message.
-
-    Raises:
-        ValueError: it is too long, or not a flat JSON object.
-        RecursionError: nested too deeply.
-    """
-    if len(data) > _MESSAGE_BYTES:
-        raise ValueError(f"expected at most {_MESSAGE_BYTES >> 10} KiB, got {len(data) >> 10} KiB")
-    if b"[" in data or data.count(b"{") > 1:
-        raise ValueError("expected a JSON object without others or lists in it")
-    text = data.decode().strip()
-    fields, end = _DECODE(text)
-    if end != len(text) or not isinstance(fields, dict):
-        raise ValueError(f"expected a JSON object, got {data[:40]!s}")
-    return fields
-
-
 @lru_cache(maxsize=16)
 def _warn_once(path: Path, _mtime_ns: int) -> None:
     """A file is read several times: for its joint, its mapping, its samples."""
@@ -220,52 +194,12 @@ def _decompressed(body: bytes, path: Path) -> bytes:
     return data
 
 
-def _messages(
-    data: bytes, channels: dict[int, str | None], topics: frozenset[str] | None, most: int, path: Path
-) -> Generator[McapMessage, None, int]:
-    """The messages among some records, whose number is returned; new channels are added to `channels`.
-
-    Raises:
-        RecordingError: there are more records than `most`.
-    """
-    at, end, count = 0, len(data), 0
-    unpack_head, unpack_message, head_size = _HEAD.unpack_from, _MESSAGE.unpack_from, _HEAD.size
-    while at < end:
-        if at + head_size > end:
-            raise _BrokenError
-        opcode, length = unpack_head(data, at)
-        begin = at + head_size
-        at = begin + length
-        count += 1
-        if count > most:
-            raise too_many_records(path)
-        if not opcode or at > end:
-            raise _BrokenError
-        if opcode == _MESSAGE_OP:
-            if length < _MESSAGE.size:
-                raise _BrokenError
-            channel, _, log_time, _ = unpack_message(data, begin)
-            topic = channels.get(channel)
-            if topic is not None:
-                if topic.endswith(_OF_NUMBERS):
-                    count += 1
-                require_stamp(log_time, path)
-                yield McapMessage(topic, log_time, data[begin + _MESSAGE.size : at])
-        elif opcode == _CHANNEL:
-            if length < _CHANNEL_HEAD.size:
-                raise _BrokenError
-            number, _, name_length = _CHANNEL_HEAD.unpack_from(data, begin)
-            begin += _CHANNEL_HEAD.size
-            name = data[begin : min(begin + name_length, at)].decode(errors="replace")
-            wanted = topics is None or name.rsplit("/", 1)[-1] in topics
-            channels[number] = name if wanted else None
-    return count
-
-
 _STALE = int(Status.STALE)
 _SERVICE = Status.having("replayed")
 _FEW = 128  # waiting cycles that are not worth a look for complete ones
 _Number = tuple[int, int]  # of a cycle: run of the daemon, sequence
+# Stamp, numbers of the sample, flags: plain numbers, which the collector of garbage need not look at.
+_Waiting = tuple[int, tuple[float | None, ...] | None, int]
 
 
 def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None = None) -> Iterator[Cycle]:
@@ -280,53 +214,67 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
     Raises:
         RecordingError: no samples in it.
     """
-    waiting: dict[_Number, Cycle] = {}
+    names, further = measured_names(motors), f"motor{motors + 1}_position_rad"
+    factors = [(scale or {}).get(name, 1.0) for name in names]
+    row_of, flags_of = JsonNumbers(("sequence", further, *names)), JsonNumbers(("sequence", "status"))
+    waiting: dict[_Number, _Waiting] = {}
     newest: dict[str, _Number] = {}  # by topic
     most, found = _FEW, False
     for message in read_messages(path, frozenset({"sample", "estimate"})):
-        sample, flags = None, 0
+        row, flags, topic = None, 0, message.topic
         try:
-            fields = message_fields(message.data)
-            if message.topic.endswith("/sample"):
-                for name, factor in (scale or {}).items():
-                    if isinstance(fields.get(name), float):
-                        fields[name] *= factor
-                if not found and f"motor{motors + 1}_position_rad" in fields:
+            if topic.endswith("/sample"):
+                row, found = row_of(message.data), True
+                sequence = _whole(row[0])
+                if row[1] is not None:
                     raise RecordingError(f"{path}: has more motors than the joint file, which has {motors}")
-                sample, found = read_sample(fields, motors), True
             else:
-                flags = int(fields["status"]) & (_SERVICE | _STALE)
-            sequence = int(fields["sequence"])
+                sequence, status = map(_whole, flags_of(message.data))
+                flags = status & (_SERVICE | _STALE)
             if not 0 <= sequence < 1 << 62:
                 raise ValueError(f"expected a sequence from 0 to 2^62, got {sequence}")
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-            raise _strange(path, message.topic, error) from error
-        run, last = newest.get(message.topic, (0, -1))
+        except (ValueError, OverflowError) as error:
+            raise _strange(path, topic, error) from error
+        run, last = newest.get(topic, (0, -1))
         number = (run + (sequence < last), sequence)  # another run: numbering began again
-        newest[message.topic] = number
+        newest[topic] = number
         if (before := waiting.get(number)) is not None:
-            sample, flags = sample or before.sample, flags | before.flags
-        waiting[number] = Cycle(sequence, message.log_time_ns, sample, flags)
+            row, flags = row or before[1], flags | before[2]
+        waiting[number] = message.log_time_ns, row, flags
         if not found and len(waiting) > MAX_UNREAD:
             break  # estimates of nothing
         if len(waiting) > most:
-            yield from _released(waiting, min(newest.values()) if len(newest) > 1 else (0, 0))
+            yield from _released(waiting, min(newest.values()) if len(newest) > 1 else (0, 0), factors)
             most = 2 * len(waiting) + _FEW
-    yield from _released(waiting, None)
+    yield from _released(waiting, None, factors)
     if not found:
         raise RecordingError(f"{path}: no samples in it (with raw frames in it: replay --frames)")
 
 
-def _released(waiting: dict[_Number, Cycle], until: _Number | None) -> Iterator[Cycle]:
+def _whole(number: float | None) -> int:
+    if number is None:
+        raise ValueError("expected a sequence, and of an estimate a status")
+    return int(number)
+
+
+def _released(
+    waiting: dict[_Number, _Waiting], until: _Number | None, factors: Sequence[float]
+) -> Iterator[Cycle]:
     """Yield the cycles before `until` (None: all), and more than may wait, in order; no estimates alone."""
     for number in sorted(waiting):
         if until is not None and number >= until and len(waiting) <= MAX_UNREAD:
             break
-        cycle = waiting.pop(number)
-        if cycle.flags & _STALE:
-            yield cycle._replace(flags=cycle.flags & _SERVICE)
-        elif cycle.sample is not None:
-            yield cycle
+        stamp_ns, row, flags = waiting.pop(number)
+        if row is not None or flags & _STALE:
+            sample = None if row is None else _sample(number[1], row[2:], factors)
+            yield Cycle(number[1], stamp_ns, sample, flags & _SERVICE)
+
+
+def _sample(sequence: int, row: Sequence[float | None], factors: Sequence[float]) -> Sample:
+    """Return the sample of the values of `measured_names`."""
+    values = tuple([math.nan if x is None else x * f for x, f in zip(row, factors, strict=True)])
+    a = len(values) // 3 - 1
+    return Sample(sequence, values[:a], values[a : 2 * a], values[2 * a : 3 * a], *values[3 * a :])
 
 
 def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
@@ -336,16 +284,17 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
         RecordingError: it cannot be read, or has no or too many samples.
     """
     columns: dict[str, array[float]] = {}
-    count = 0
+    count, numbers_of = 0, JsonNumbers(sorted(COLUMNS))
     for message in read_messages(path, frozenset({"sample"})):
         try:
-            row = message_fields(message.data)
+            row = numbers_of(message.data)
             if not count:
-                columns = {name: array("d") for name in row if name in COLUMNS}
-            for name, values in columns.items():
-                value = row.get(name)
+                found = [name for name, x in zip(sorted(COLUMNS), row, strict=True) if x is not None]
+                numbers_of, columns = JsonNumbers(found), {name: array("d") for name in found}
+                row = numbers_of(message.data)
+            for values, value in zip(columns.values(), row, strict=True):
                 values.append(math.nan if value is None else value)
-        except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        except ValueError as error:
             raise _strange(path, message.topic, error) from error
         count += 1
         require_samples(count, str(path))

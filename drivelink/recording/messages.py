@@ -142,19 +142,11 @@ def log_message(joint: str, time_s: float, text: str) -> bytes:
 
 
 @cache
-def _measured(motors: int) -> tuple[str, ...]:
+def measured_names(motors: int) -> tuple[str, ...]:
     """Return what a sample's message may hold, in order: positions, velocities, torques, then of the link."""
     kinds = ("position_rad", "velocity_rad_s", "torque_nm")
     of_motors = (f"motor{i}_{kind}" for kind in kinds for i in range(1, motors + 1))
     return (*of_motors, "link_position_rad", "link_velocity_rad_s", "external_torque_nm")
-
-
-def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
-    """Return the sample of a message, bit for bit; null becomes NaN."""
-    found = map(message.get, _measured(motors))
-    values = tuple([math.nan if value is None else float(value) for value in found])
-    a, b, c = motors, 2 * motors, 3 * motors
-    return Sample(int(message["sequence"]), values[:a], values[a:b], values[b:c], *values[c:])
 
 
 _INTEGER, _TEXT, _FLAG = {"type": "integer"}, {"type": "string"}, {"type": "boolean"}

@@ -7,8 +7,10 @@
 pub mod assembler;
 pub mod cross_check;
 pub mod frames;
+pub mod json;
 pub mod latency;
 pub mod layout;
+pub mod mcap;
 pub mod node;
 pub mod pipeline;
 #[cfg(feature = "python")]

@@ -2,6 +2,7 @@
 
 mod assembler;
 mod latency;
+mod mcap;
 mod pipeline;
 mod tick;
 mod values;
@@ -35,6 +36,8 @@ mod extension {
     use super::assembler::Assembler;
     #[pymodule_export]
     use super::latency::LatencyHistogram;
+    #[pymodule_export]
+    use super::mcap::{JsonNumbers, McapMessage, McapMessages, json_frame};
     #[pymodule_export]
     use super::pipeline::JointPipeline;
     #[pymodule_export]

@@ -93,7 +93,7 @@ def test_the_command_takes_several_and_says_how_each_does(runs, tmp_path, capsys
     document = json.loads((tmp_path / "fit.json").read_text())
     assert [one["recording"] for one in document["recordings"]] == ["monday.csv", "tuesday.csv"]
     for one in document["recordings"]:
-        assert f"{one['validation']['rms_nm']:.4f} N·m  {100.0 * one['validation']['relative']:.2f} %" in said
+        assert f"{one['validation']['rms_nm']:.5f} N·m  {100.0 * one['validation']['relative']:.2f} %" in said
     written = tomllib.loads(target.read_text())
     assert written["motor"][0]["transmission"]["parameters"] == document["transmissions"][0]["parameters"]
     assert written["provenance"]["fit"]["recording"] == "monday.csv, tuesday.csv"

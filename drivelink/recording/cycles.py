@@ -191,7 +191,9 @@ class Assembly:
                 self._recent.add(sample)
             elif is_sync and jump and (missed := assembler.missed) >= 0:
                 cycle = Cycle(missed, self._before_ns, None, assembler.flags)
-            if can_id in _FOLLOWED:  # it is compared with the mapping after its cycle was made
+            if is_sync:  # it is compared with the mapping after its cycle was made
+                self.follower.sync()
+            elif can_id in OF_MAPS:
                 self.follower.feed(can_id, data, seconds(stamp_ns, assembler.sequence, self._period_s))
             if cycle is not None:
                 yield cycle

@@ -23,7 +23,7 @@ from drivelink.canopen.eds import load_eds
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import ZenohSection, load
 from drivelink.recording import canframes, read
-from drivelink.recording.canlog import CAN_FORMATS, LoggedFrame, read_frames
+from drivelink.recording.canlog import CAN_FORMATS, LoggedFrame, in_order, read_frames
 from drivelink.recording.corrections import Gathered
 from drivelink.recording.cycles import SyncNumbering
 from drivelink.recording.formats import FORMATS, open_sink
@@ -332,6 +332,13 @@ def test_sync_frames_after_lost_ones_cost_no_more_than_others():
             numbering.push(LoggedFrame(k * step_ns, 0x080, b"", ""))
         costs.append(time.process_time() - begin)
     assert costs[1] < 3.0 * costs[0]
+
+
+def test_stamps_that_jump_back_again_and_again_are_two_lines(tmp_path, caplog):
+    """Each jump was a line: 80 000 of them for a megabyte."""
+    back = [LoggedFrame(10**18 - k * 2 * 10**9, 0x80, b"", "") for k in range(1000)]
+    assert len(list(in_order(back, tmp_path))) == 1000
+    assert len([text for text in caplog.messages if "jump back" in text]) == 2
 
 
 def test_frames_are_the_same_whether_drivelink_or_another_tool_wrote_them(tmp_path):

@@ -116,9 +116,9 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
 def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]:
     """Make stamps continue where they jump back (a clock that was set, or two logs in one file).
 
-    The unknown time between counts as a gap of one second and is reported.
+    The unknown time between counts as a gap of one second; the first is reported, and how many follow.
     """
-    offset = last = 0
+    offset = last = jumps = 0
     for frame in frames:
         stamp_ns = frame[0] + offset
         if last <= stamp_ns <= LAST_STAMP_NS:
@@ -126,18 +126,22 @@ def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]
             yield frame._replace(stamp_ns=stamp_ns) if offset else frame
             continue
         if last - stamp_ns > _DISORDER_NS and frame.stamp_ns != NO_STAMP:
-            _LOG.warning(
-                "%s: the stamps jump back by %.4g s at %.6f s: taken as a gap of %g s",
-                path,
-                (last - stamp_ns) * 1e-9,
-                frame.stamp_ns * 1e-9,
-                _GAP_NS * 1e-9,
-            )
+            jumps += 1
+            if jumps == 1:
+                _LOG.warning(
+                    "%s: the stamps jump back by %.4g s at %.6f s: taken as a gap of %g s",
+                    path,
+                    (last - stamp_ns) * 1e-9,
+                    frame.stamp_ns * 1e-9,
+                    _GAP_NS * 1e-9,
+                )
             offset += last + _GAP_NS - stamp_ns
             stamp_ns = last + _GAP_NS
         require_stamp(stamp_ns, path)
         last = max(last, stamp_ns)
         yield frame._replace(stamp_ns=stamp_ns) if offset and frame.stamp_ns != NO_STAMP else frame
+    if jumps > 1:
+        _LOG.warning("%s: the stamps jump back %d times more", path, jumps - 1)
 
 
 def _channel(head: list[LoggedFrame], configured: str, path: Path) -> str | None:

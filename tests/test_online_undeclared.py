@@ -89,6 +89,18 @@ def test_a_torque_that_is_read_late_is_no_other_effect(periods, names):
     assert np.max(off) < 0.01
 
 
+def test_a_link_encoder_that_is_eccentric_is_named_and_the_stiffness_of_a_stiff_joint_right():
+    """An error of 2e-4 rad (0.01°), a twentieth of the deflections: unexplained it moves the stiffness by a tenth."""
+    truth, record, joint = read(1500.0, 5e6)
+    q = record.link_position_rad
+    estimates, estimator = kit.play(joint, replace(record, link_position_rad=q + 2e-4 * np.sin(q)).samples())
+    off = np.abs(estimates.stiffness_nm_rad / truth.sigma[:, 0, 0] - 1.0)[-4000:]
+    assert estimator.undeclared()[0] == ["encoder_eccentricity"]
+    assert np.mean(estimates.valid[-4000:]) > 0.5  # the interval is nearly as wide as valid_within
+    assert np.all(off < 3.0 * estimates.std_nm_rad[-4000:] / truth.sigma[-4000:, 0, 0])
+    assert np.max(off) < 0.05
+
+
 @pytest.mark.parametrize(("off_rad", "names"), [(0.003, []), (0.01, ["deflection_offset"])])
 def test_a_zero_that_is_elsewhere_from_the_start_is_found_where_the_spring_shows_it(off_rad, names):
     truth, record, joint = read(150.0, 8000.0)

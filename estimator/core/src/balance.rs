@@ -6,9 +6,8 @@
 use serde::{Deserialize, Serialize};
 
 use crate::choices::{FAR, GROWN, SLOW};
-use crate::filters::StateVariableFilter;
 use crate::gram::{COLUMNS, Gram, Row};
-use crate::signals::{Channel, Filters, Formed};
+use crate::signals::{Channel, Filters, Formed, Lanes};
 use crate::spring::{Family, TERMS};
 
 /// F τ, N·m.
@@ -43,11 +42,15 @@ pub const STOPS: std::ops::Range<usize> = 24..27;
 pub const CLIPS: std::ops::Range<usize> = 27..31;
 /// −u |u|: a spring whose stiffness has a corner at zero, N·m.
 pub const CORNER: usize = 31;
+/// −bₖ′ sin q, the first ones: a link encoder that is eccentric.
+pub const SINE: std::ops::Range<usize> = 32..34;
+/// −bₖ′ cos q, likewise.
+pub const COSINE: std::ops::Range<usize> = 34..36;
 
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
 const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len() + 2; // columns that are functions of the raw φ
-const FORMED: usize = 9; // columns of lightly filtered signals: dry, soft, load ×2, late, read, stops ×3
+const FORMED: usize = 13; // columns of lightly filtered signals: dry, soft, load ×2, late, read, stops ×3, sine ×2, cosine ×2
 
 /// What the columns are scaled by, taken from the motion.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -58,34 +61,6 @@ pub struct Size {
     pub range: f64,
     /// Largest |θ′|, rad/s: that of friction.
     pub speed: f64,
-}
-
-/// Signals side by side through one filter; what they were at the last sample.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-struct Lanes<const N: usize, const L: usize> {
-    #[serde(with = "crate::snapshot::rows")]
-    state: [[f64; L]; N],
-    #[serde(with = "crate::snapshot::array")]
-    last: [f64; L],
-}
-
-impl<const N: usize, const L: usize> Lanes<N, L> {
-    fn rest(values: [f64; L]) -> Lanes<N, L> {
-        let mut state = [[0.0; L]; N];
-        state[0] = values;
-        Lanes { state, last: values }
-    }
-
-    fn smooth(&mut self, filter: &StateVariableFilter<N>, now: [f64; L]) {
-        filter.smooth.apply_lanes(&mut self.state, &self.last, &now);
-        self.last = now;
-    }
-
-    fn scale(&mut self, factors: &[f64; L]) {
-        for values in self.state.iter_mut().chain([&mut self.last]) {
-            values.iter_mut().zip(factors).for_each(|(value, factor)| *value *= factor);
-        }
-    }
 }
 
 /// The filtered columns of one motor.
@@ -102,6 +77,7 @@ pub struct Balance {
     curve: Lanes<4, CURVE>,
     formed: Lanes<4, FORMED>,
     effects: Formed,
+    waves: [f64; 2], // sin q and cos q
     stops: [f64; 3],
     last: f64, // φ that the stops have followed
     low: f64,
@@ -123,6 +99,7 @@ impl Balance {
             curve: Lanes::rest([0.0; CURVE]),
             formed: Lanes::rest([0.0; FORMED]),
             effects: Formed::default(),
+            waves: [0.0; 2],
             stops: [0.0; 3],
             last: 0.0,
             low: f64::INFINITY,
@@ -242,11 +219,11 @@ impl Balance {
         }
         let terms = self.family.factors(before, self.size.deflection);
         factors[SPRING.start..SPRING.start + 2 * TERMS].copy_from_slice(&terms);
-        for columns in [LATE, READ] {
+        for columns in [LATE, READ, SINE, COSINE] {
             factors[columns.clone()].copy_from_slice(&terms[TERMS..TERMS + columns.len()]);
         }
-        // The first slope is 1 in every size; the columns of q and q′ are not filtered with it.
-        (factors[LATE.start], factors[READ.start]) = (1.0, 1.0);
+        // The first slope is 1 in every size; the columns of q are not filtered with it.
+        [LATE, READ, SINE, COSINE].iter().for_each(|columns| factors[columns.start] = 1.0);
         LOAD.iter().zip(&terms).for_each(|(column, factor)| factors[*column] = *factor);
         let mut curve = [1.0; CURVE];
         curve[..2 * TERMS].copy_from_slice(&terms);
@@ -256,7 +233,8 @@ impl Balance {
         self.light.scale(&curve);
         self.curve.scale(&curve);
         let slope = terms[TERMS + 1];
-        self.formed.scale(&[1.0, 1.0, terms[0], terms[1], slope, slope, 1.0, 1.0, 1.0]);
+        self.formed
+            .scale(&[1.0, 1.0, terms[0], terms[1], slope, slope, 1.0, 1.0, 1.0, 1.0, slope, 1.0, slope]);
         factors
     }
 
@@ -296,7 +274,12 @@ impl Balance {
         let [q, q_rate] = [link.light[0], link.light[1]];
         let soft = (rate / (FAR * speed)).tanh();
         let load = [slopes[0].abs() * sign, slopes[1].abs() * sign];
-        let now = [sign, soft, load[0], load[1], -slope * q_rate, -slope * q, -a, -b, -c];
+        let (sine, cosine) = q.sin_cos();
+        self.waves = [sine, cosine];
+        let link = [-slope * q_rate, -slope * q, -a, -b, -c, -sine, -slope * sine, -cosine, -slope * cosine];
+        let mut now = [0.0; FORMED];
+        now[..4].copy_from_slice(&[sign, soft, load[0], load[1]]);
+        now[4..].copy_from_slice(&link);
         self.formed.smooth(&filters.main, now);
     }
 
@@ -316,7 +299,8 @@ impl Balance {
         (row[LATE.start], row[READ.start]) = (-link.main[1], -link.main[0]);
         let formed = &self.formed.state[0];
         let places = [DRY, SOFT, LOAD[0], LOAD[1], LATE.start + 1, READ.start + 1];
-        for (column, value) in places.into_iter().chain(STOPS).zip(formed) {
+        let ranges = STOPS.chain(SINE).chain(COSINE);
+        for (column, value) in places.into_iter().chain(ranges).zip(formed) {
             row[column] = *value;
         }
         row
@@ -352,6 +336,12 @@ impl Balance {
         let outwards = -clips[k] / range;
         let inwards = if k == 0 { -stiffness.max(0.0) } else { clips[k - 1] / range };
         (-outwards * inwards).max(0.0)
+    }
+
+    /// sin q and cos q.
+    #[must_use]
+    pub fn waves(&self) -> [f64; 2] {
+        self.waves
     }
 
     /// Filtered θ′, rad/s.

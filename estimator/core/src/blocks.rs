@@ -47,6 +47,8 @@ pub struct Readings {
     pub white: f64,
     /// That of the positions' noise alone, which is in the columns, (N·m)².
     pub positions: f64,
+    /// Variance of the filtered deflection that it makes, rad².
+    pub deflection: f64,
     /// Resolution of the deflection, rad: rounding moves its zero by as much.
     pub resolution: f64,
 }
@@ -90,6 +92,7 @@ pub struct Blocks {
     lost: bool,   // the zero: it may be anywhere, but for what motion shows
     powers: [f64; TERMS],
     frame: Option<Frame>,
+    #[serde(with = "crate::snapshot::array")]
     residual: Row,
     odds: Option<Odds>,
     /// Whether samples of late could not be used.

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::balance::{ACCELERATION, DRY, LATE, OFFSET, READ, SPRING, TORQUE, TORQUE_RATE, VELOCITY};
 use crate::choices::EVEN;
 use crate::gram::{
-    COLUMNS, Frame, Gram, Matrix, Prior, Row, Set, UNKNOWNS, dot, log_determinant, solve, unknowns,
+    COLUMNS, Frame, Gram, Matrix, Prior, Reduced, Row, Set, UNKNOWNS, dot, log_determinant, solve, unknowns,
 };
 use crate::spring::{Coefficients, TERMS};
 use crate::unknowns;
@@ -263,7 +263,7 @@ impl Known<'_> {
             -0.5 * (independent + noise.tails) * (square / noise.tails).ln_1p() + 0.5 * log_ratio
         };
         let mut odds = Odds { of: [Explanation::default(); CAUSES], log: [f64::NEG_INFINITY; CAUSES] };
-        let mut judged = |cause: Cause, reduced: &Matrix, set: Set, prior: &Prior, unit: f64| {
+        let mut judged = |cause: Cause, reduced: &Reduced, set: Set, prior: &Prior, unit: f64| {
             let Some(found) = solve(reduced, set, prior, scale) else { return f64::INFINITY };
             let log_ratio = log_determinant(&prior.precision, set)
                 - log_determinant(&information(reduced, &prior.precision, scale), set);
@@ -302,7 +302,7 @@ impl Known<'_> {
 }
 
 /// Reduced sums with one more direction, in the place `own`.
-fn with_direction(reduced: &Matrix, window: &Gram, frame: &Frame, v: &Row, own: usize) -> Matrix {
+fn with_direction(reduced: &Reduced, window: &Gram, frame: &Frame, v: &Row, own: usize) -> Reduced {
     let mut more = *reduced;
     let image = window.times(v);
     for i in unknowns(frame.set) {
@@ -320,10 +320,10 @@ fn put(v: &mut Row, column: usize, value: f64) -> f64 {
     value
 }
 
-fn information(reduced: &Matrix, precision: &Matrix, scale: f64) -> Matrix {
+fn information(reduced: &Reduced, precision: &Matrix, scale: f64) -> Matrix {
     let mut out = *precision;
-    for (row, sums) in out.iter_mut().zip(reduced) {
-        row.iter_mut().zip(sums).for_each(|(value, sum)| *value += sum / scale);
+    for (i, row) in out.iter_mut().enumerate() {
+        row.iter_mut().zip(&reduced[i]).for_each(|(value, sum)| *value += sum / scale);
     }
     out
 }

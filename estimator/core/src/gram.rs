@@ -5,19 +5,23 @@
 //! the evidence of a sub-model and the misfit of a block follow from sums.
 
 mod cholesky;
+mod frame;
+
+use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
 use cholesky::Cholesky;
+pub use frame::{Frame, Reduced};
 
 /// Columns of a row.
-pub const COLUMNS: usize = 32;
+pub const COLUMNS: usize = 36;
 
 /// One value a column.
 pub type Row = [f64; COLUMNS];
 
 /// Unknowns of a balance, with index 0 for what they explain.
-pub const UNKNOWNS: usize = 27;
+pub const UNKNOWNS: usize = 29;
 
 /// One value an unknown.
 pub type Vector = [f64; UNKNOWNS];
@@ -30,14 +34,14 @@ pub type Set = u32;
 
 const PIVOT: f64 = 1e-13; // of a scaled diagonal of 1: rounding of sums of products
 
-/// COLUMNS, as a number that the compiler does not see: unrolled, 32 columns are 528 statements a loop.
+/// COLUMNS, as a number that the compiler does not see: unrolled, 36 columns are 666 statements a loop.
 fn all() -> usize {
     std::hint::black_box(COLUMNS)
 }
 
 /// The bits of some unknowns.
 #[must_use]
-pub fn set(unknowns: std::ops::Range<usize>) -> Set {
+pub fn set(unknowns: Range<usize>) -> Set {
     unknowns.fold(0, |set, unknown| set | 1 << unknown)
 }
 
@@ -59,6 +63,7 @@ fn product(a: &[f64], b: &[f64]) -> f64 {
 /// Σ z zᵀ of rows: the lower triangle, and how many rows.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Gram {
+    #[serde(with = "crate::snapshot::rows")]
     sums: [Row; COLUMNS],
     /// Number of rows.
     pub rows: f64,
@@ -100,6 +105,19 @@ impl Gram {
         }
     }
 
+    /// The noise in functions of a signal that has this variance of it, from the columns of their slopes.
+    #[must_use]
+    pub fn noise(&self, of: Range<usize>, slopes: usize, variance: f64) -> Gram {
+        let mut out = Gram { rows: self.rows, ..Gram::default() };
+        let first = of.start;
+        for i in of {
+            for j in first..=i {
+                out.sums[i][j] = variance * self.at(slopes + i - first, slopes + j - first);
+            }
+        }
+        out
+    }
+
     /// One entry.
     #[must_use]
     pub fn at(&self, i: usize, j: usize) -> f64 {
@@ -128,53 +146,6 @@ impl Gram {
     #[must_use]
     pub fn quadratic(&self, c: &Row) -> f64 {
         dot(&self.times(c), c).max(0.0)
-    }
-}
-
-/// What each unknown adds to a row's balance, and what they explain together.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Frame {
-    /// z · left is what is explained.
-    pub left: Row,
-    /// z · d is what an unknown of 1 explains; index 0 is not used.
-    pub directions: [Row; UNKNOWNS],
-    /// The unknowns that have a direction.
-    pub set: Set,
-}
-
-impl Frame {
-    /// The residual of a row is z · c.
-    #[must_use]
-    pub fn residual(&self, x: &Vector, set: Set) -> Row {
-        let mut c = self.left;
-        for j in unknowns(set & self.set) {
-            c.iter_mut().zip(&self.directions[j]).for_each(|(c, d)| *c -= x[j] * d);
-        }
-        c
-    }
-
-    /// rms of what some of the unknowns explain of the rows.
-    #[must_use]
-    pub fn rms(&self, gram: &Gram, known: &Posterior, of: Set) -> f64 {
-        let mut c = [0.0; COLUMNS];
-        for j in unknowns(of & known.set & self.set) {
-            c.iter_mut().zip(&self.directions[j]).for_each(|(c, d)| *c += known.x[j] * d);
-        }
-        (gram.quadratic(&c) / gram.rows.max(1.0)).sqrt()
-    }
-
-    /// Dᵀ G D with `left` as the direction of index 0.
-    #[must_use]
-    pub fn reduce(&self, gram: &Gram) -> Matrix {
-        let mut out = [[0.0; UNKNOWNS]; UNKNOWNS];
-        for j in std::iter::once(0).chain(unknowns(self.set)) {
-            let image = gram.times(if j == 0 { &self.left } else { &self.directions[j] });
-            for i in std::iter::once(0).chain(unknowns(self.set)).filter(|i| *i <= j) {
-                let value = dot(&image, if i == 0 { &self.left } else { &self.directions[i] });
-                (out[i][j], out[j][i]) = (value, value);
-            }
-        }
-        out
     }
 }
 
@@ -240,7 +211,7 @@ pub fn inverse(matrix: &Matrix, set: Set) -> Matrix {
 }
 
 /// Information, its vector and the square of what there is to explain, of a set's unknowns.
-fn system(reduced: &Matrix, set: Set, prior: &Prior, noise: f64) -> (Cholesky, Vector, f64) {
+fn system(reduced: &Reduced, set: Set, prior: &Prior, noise: f64) -> (Cholesky, Vector, f64) {
     let cholesky = Cholesky::new(set, |i, j| reduced[i][j] / noise + prior.precision[i][j]);
     let (mut vector, mut square) = ([0.0; UNKNOWNS], reduced[0][0] / noise);
     for i in unknowns(set) {
@@ -253,18 +224,22 @@ fn system(reduced: &Matrix, set: Set, prior: &Prior, noise: f64) -> (Cholesky, V
 
 /// ln of the marginal likelihood of a set's unknowns, but for what all sets have in common.
 ///
+/// A set with a weaker spring leaves less of the noise that is in the deflection: that speaks for none.
+///
 /// `noise`: variance of a row times the rows that an independent one is worth.
 #[must_use]
-pub fn log_evidence(reduced: &Matrix, set: Set, prior: &Prior, noise: f64) -> f64 {
+pub fn log_evidence(reduced: &Reduced, set: Set, prior: &Prior, noise: f64) -> f64 {
     let (cholesky, vector, square) = system(reduced, set, prior, noise);
-    let gain: f64 = cholesky.whiten(&vector).iter().map(|u| u * u).sum();
+    let white = cholesky.whiten(&vector);
+    let gain: f64 = white.iter().map(|u| u * u).sum();
     let before = Cholesky::new(set, |i, j| prior.precision[i][j]).log_determinant;
-    0.5 * (before - cholesky.log_determinant - square + gain)
+    let left = reduced.left_noise(&cholesky.unwhiten(&white), set);
+    0.5 * (before - cholesky.log_determinant - square + gain + left / noise)
 }
 
 /// Posterior of a set's unknowns; `None`: a number is not finite. `noise`: see [`log_evidence`].
 #[must_use]
-pub fn solve(reduced: &Matrix, set: Set, prior: &Prior, noise: f64) -> Option<Posterior> {
+pub fn solve(reduced: &Reduced, set: Set, prior: &Prior, noise: f64) -> Option<Posterior> {
     let (cholesky, vector, _) = system(reduced, set, prior, noise);
     let covariance = cholesky.inverse();
     let mut x = [0.0; UNKNOWNS];
@@ -281,7 +256,7 @@ pub fn solve(reduced: &Matrix, set: Set, prior: &Prior, noise: f64) -> Option<Po
 /// A group is added if it raises the evidence by more than the number of groups: the odds against each before
 /// any data. Of two that explain the same, one of the `usual` unknowns is as much likelier.
 #[must_use]
-pub fn choose(reduced: &Matrix, base: Set, groups: &[Set], usual: Set, prior: &Prior, noise: f64) -> Set {
+pub fn choose(reduced: &Reduced, base: Set, groups: &[Set], usual: Set, prior: &Prior, noise: f64) -> Set {
     let threshold = (groups.iter().filter(|group| **group != 0).count().max(1) as f64).ln();
     let (mut set, mut best) = (base, log_evidence(reduced, base, prior, noise));
     loop {

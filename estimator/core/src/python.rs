@@ -169,6 +169,7 @@ fn priors(py: Python<'_>) -> PyResult<Priors> {
         deflection_offset: std("declared_zero")?,
         encoder_delay: std("encoder_delay")?,
         load_dependent_friction: std("load_dependent_friction")?,
+        encoder_eccentricity: std("encoder_eccentricity")?,
         undeclared: std("undeclared_effect")?,
         law: std("declared_law")?,
         spring: std("transmission")?,

@@ -103,6 +103,8 @@ pub struct Priors {
     pub encoder_delay: f64,
     /// Of the share of the torque that a gear loses.
     pub load_dependent_friction: f64,
+    /// Of what the link encoder reads wrong once a revolution, rad.
+    pub encoder_eccentricity: f64,
     /// Of any other effect that nobody declared, as a share of the torque.
     pub undeclared: f64,
     /// Of a law's parameter that is declared without its own, relative to it.
@@ -123,6 +125,7 @@ impl Priors {
         deflection_offset: 0.003,
         encoder_delay: 1.0,
         load_dependent_friction: 0.25,
+        encoder_eccentricity: 0.01,
         undeclared: 0.05,
         law: 0.3,
         spring: 10.0,

@@ -319,6 +319,7 @@ impl Side {
         self.blocks.readings = Readings {
             white: in_columns + gains[0] * torque_noise,
             positions: in_columns,
+            deflection: gains[0] * positions,
             resolution: (12.0 * positions).sqrt(),
         };
         let row = self.balance.row(link);

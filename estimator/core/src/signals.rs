@@ -140,6 +140,40 @@ impl Excitation {
     }
 }
 
+/// Signals side by side through one filter; what they were at the last sample.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub struct Lanes<const N: usize, const L: usize> {
+    #[serde(with = "crate::snapshot::rows")]
+    /// Of the filter, signal by signal within each of its orders.
+    pub state: [[f64; L]; N],
+    #[serde(with = "crate::snapshot::array")]
+    /// What went in at last.
+    pub last: [f64; L],
+}
+
+impl<const N: usize, const L: usize> Lanes<N, L> {
+    /// As if they had had these values for ever.
+    #[must_use]
+    pub fn rest(values: [f64; L]) -> Lanes<N, L> {
+        let mut state = [[0.0; L]; N];
+        state[0] = values;
+        Lanes { state, last: values }
+    }
+
+    /// One period.
+    pub fn smooth(&mut self, filter: &StateVariableFilter<N>, now: [f64; L]) {
+        filter.smooth.apply_lanes(&mut self.state, &self.last, &now);
+        self.last = now;
+    }
+
+    /// Each signal times a factor.
+    pub fn scale(&mut self, factors: &[f64; L]) {
+        for values in self.state.iter_mut().chain([&mut self.last]) {
+            values.iter_mut().zip(factors).for_each(|(value, factor)| *value *= factor);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,11 +1,13 @@
 //! The unknowns of a motor's balance: what each adds to a row, what is believed of it before any data, and what
 //! torque and stiffness they make at a deflection.
 
+mod candidates;
 mod prior;
 mod reading;
 
 use serde::{Deserialize, Serialize};
 
+pub use candidates::CANDIDATES;
 pub use reading::Reading;
 
 use crate::balance::{self};
@@ -45,6 +47,8 @@ pub const CLIPS: std::ops::Range<usize> = 20..24;
 pub const CORNER: std::ops::Range<usize> = 24..25;
 /// A spring that is stiffer to one side: of |φ|, N·m at the largest deflection, and of φ², N·m/rad².
 pub const ASYMMETRY: std::ops::Range<usize> = 25..27;
+/// What the link encoder reads too little, by sin q and cos q, rad.
+pub const ECCENTRIC: std::ops::Range<usize> = 27..29;
 
 /// Those that every joint has.
 pub const ACTIVE: Set = (1 << TORQUE_LATE) - 2;
@@ -53,25 +57,6 @@ const USUAL: usize = 2; // powers that springs of which nothing is declared have
 const SHAPES: usize = 12; // of a law that are tried before any is known
 const NARROWEST: f64 = 0.05; // of them: the bend that a shape makes over the deflection seen …
 const WIDEST: f64 = 6.0; // … and the largest
-
-/// One effect that the joint file need not name.
-pub struct Candidate {
-    /// Its unknowns.
-    pub unknowns: std::ops::Range<usize>,
-    /// Its name in `report.json`.
-    pub name: &'static str,
-}
-
-/// The groups of unknowns that evidence chooses.
-pub const CANDIDATES: [Candidate; 7] = [
-    Candidate { unknowns: TORQUE_LATE..SOFT, name: "torque_delay" },
-    Candidate { unknowns: SOFT..SOFT + 1, name: "stribeck_friction" },
-    Candidate { unknowns: LOAD, name: "load_dependent_friction" },
-    Candidate { unknowns: RATE..RATE + 1, name: "transmission_damping" },
-    Candidate { unknowns: STOPS, name: "hysteresis" },
-    Candidate { unknowns: CLIPS, name: "backlash" },
-    Candidate { unknowns: ASYMMETRY, name: "asymmetric_stiffness" },
-];
 
 /// What the priors of zero, shape and delay are measured by.
 #[derive(Clone, Copy, Debug)]
@@ -343,7 +328,12 @@ impl Spring {
         let slope = self.slope(projection);
         let moved = projection.of(|phi| self.law.at(phi + self.zero, alpha).1);
         place(&mut frame.directions[ZERO], &moved, 1.0);
-        (frame.directions[LATE], frame.set) = (late(&slope, balance::LATE.start), set(1..UNKNOWNS));
+        let signals =
+            [balance::LATE, balance::SINE, balance::COSINE].map(|columns| late(&slope, columns.start));
+        for (unknown, direction) in [LATE].into_iter().chain(ECCENTRIC).zip(signals) {
+            frame.directions[unknown] = direction;
+        }
+        frame.set = set(1..UNKNOWNS);
         for unknown in SPRING.skip(self.size) {
             frame.set &= !(1 << unknown);
         }
@@ -351,7 +341,7 @@ impl Spring {
             frame.set &= !set(CORNER);
         }
         if slope.iter().all(|s| *s == 0.0) {
-            frame.set &= !(1 << ZERO | 1 << LATE);
+            frame.set &= !(1 << ZERO | 1 << LATE | set(ECCENTRIC));
         }
         frame
     }

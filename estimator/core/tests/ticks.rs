@@ -111,6 +111,7 @@ fn priors() -> Priors {
         deflection_offset: 0.05,
         encoder_delay: 1.0,
         load_dependent_friction: 0.25,
+        encoder_eccentricity: 0.01,
         undeclared: 0.05,
         law: 0.3,
         spring: 10.0,

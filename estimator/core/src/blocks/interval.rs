@@ -4,7 +4,8 @@ use super::Blocks;
 use super::solve::{ALONE, is_causal};
 use crate::choices::{ALIKE, EVEN, EXACT, FEWEST, UNLIKE};
 use crate::gram::{
-    Frame, Gram, Matrix, Posterior, Prior, UNKNOWNS, by_prior, cluster, log_evidence, set, solve, unknowns,
+    Frame, Gram, Matrix, Posterior, Prior, Reduced, UNKNOWNS, by_prior, cluster, log_evidence, set, solve,
+    unknowns,
 };
 use crate::student::t_95;
 use crate::unknowns::{DRY, INERTIA, LATE, OFFSET, SPRING, ZERO};
@@ -17,7 +18,7 @@ impl Blocks {
     pub(super) fn omitted(
         &self,
         frame: &Frame,
-        reduced: &Matrix,
+        reduced: &Reduced,
         total: &Gram,
         chosen: &Posterior,
         prior: &Prior,

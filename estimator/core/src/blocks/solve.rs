@@ -4,7 +4,7 @@ use super::Blocks;
 use crate::balance;
 use crate::choices::{ACCUSED, EXACT, FEWEST, MARGIN, REACHED, SURE};
 use crate::gram::{
-    COLUMNS, Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, choose, dot, log_evidence, set,
+    COLUMNS, Frame, Gram, Posterior, Prior, Reduced, Row, Set, UNKNOWNS, choose, dot, log_evidence, set,
     solve, unknowns,
 };
 use crate::laws::{Law, PARAMETERS};
@@ -168,9 +168,11 @@ impl Blocks {
         let Some(projection) = self.projection.clone() else { return };
         let near = self.priors.deflection_offset * self.deflection + self.readings.resolution;
         let zero = if self.lost { self.deflection } else { near };
+        let noise = self.readings.deflection / self.deflection.powi(2);
+        let noise = total.noise(balance::SPRING, balance::SLOPE.start, noise);
         for step in 0..STEPS {
             let frame = self.spring.frame(&projection);
-            let reduced = frame.reduce(&total);
+            let reduced = frame.reduce_noisy(&total, &noise);
             let prior = self.prior(&total, &frame, zero);
             if step == 0 {
                 let elsewhere = self.prior(&total, &frame, self.deflection);
@@ -209,7 +211,7 @@ impl Blocks {
     }
 
     /// The noise is what all unknowns together leave, the zero anywhere; it decides how many of them there are.
-    fn measure(&mut self, frame: &Frame, reduced: &Matrix, prior: &Prior, total: &Gram) {
+    fn measure(&mut self, frame: &Frame, reduced: &Reduced, prior: &Prior, total: &Gram) {
         let floor = (EXACT * total.rms(balance::TORQUE)).powi(2);
         if self.carried.is_some() && self.ring.len() < FEWEST {
             return; // it is as noisy as it was
@@ -272,7 +274,7 @@ impl Blocks {
     fn choose(
         &self,
         frame: &Frame,
-        reduced: &Matrix,
+        reduced: &Reduced,
         total: &Gram,
         prior: &Prior,
         noise: f64,
@@ -310,7 +312,7 @@ impl Blocks {
     /// The unknowns of these groups that evidence chooses.
     fn chosen(
         &self,
-        reduced: &Matrix,
+        reduced: &Reduced,
         base: Set,
         groups: &Groups,
         prior: &Prior,

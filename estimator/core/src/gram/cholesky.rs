@@ -46,6 +46,17 @@ impl Cholesky {
         out
     }
 
+    /// L⁻ᵀ of a whitened vector, by unknowns.
+    pub(super) fn unwhiten(&self, white: &Vector) -> Vector {
+        let (mut scaled, mut out) = (*white, [0.0; UNKNOWNS]);
+        for i in (0..self.n).rev() {
+            let rest: f64 = (i + 1..self.n).map(|k| self.factor[k][i] * scaled[k]).sum();
+            scaled[i] = (scaled[i] - rest) / self.factor[i][i];
+            out[self.index[i]] = scaled[i] * self.scale[i];
+        }
+        out
+    }
+
     /// The inverse, by unknowns.
     pub(super) fn inverse(&self) -> Matrix {
         let (mut lower, mut out) = ([[0.0; UNKNOWNS]; UNKNOWNS], [[0.0; UNKNOWNS]; UNKNOWNS]);

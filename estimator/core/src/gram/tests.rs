@@ -109,6 +109,30 @@ fn evidence_takes_the_unknown_that_acts_and_leaves_the_one_that_does_not() {
 }
 
 #[test]
+fn a_column_that_leaves_less_of_the_noise_of_another_one_is_no_evidence() {
+    // Column 1 is column 2 read with noise; what is explained follows column 1's truth, whose reading's noise remains.
+    let (gain, deviation, mut seed) = (5.0, 0.02, 3);
+    let prior = Prior::independent([0.0; UNKNOWNS], &[10.0; UNKNOWNS]);
+    let read: Vec<Row> = (0..4000)
+        .map(|_| {
+            let (truth, error) = (noise(&mut seed), deviation * noise(&mut seed) / 0.5);
+            let mut row = [0.0; COLUMNS];
+            (row[0], row[1], row[2], row[3]) = (gain * truth, truth + error, truth, 1.0);
+            row
+        })
+        .collect();
+    let (gram, frame) = (sum(&read), plain(0b110));
+    let left = gram.quadratic(&frame.residual(&[gain; UNKNOWNS], 0b10)) / gram.rows;
+    let of_column = left / gain.powi(2); // its variance
+    let noisy = frame.reduce_noisy(&gram, &gram.noise(1..2, 3, of_column));
+    let odds = |reduced: &Reduced| {
+        log_evidence(reduced, 0b110, &prior, left) - log_evidence(reduced, 0b10, &prior, left)
+    };
+    assert!(odds(&frame.reduce(&gram)) > 100.0);
+    assert!(odds(&noisy) < 0.0, "{}", odds(&noisy));
+}
+
+#[test]
 fn of_two_that_explain_the_same_evidence_takes_the_usual_one() {
     let prior = Prior::independent([0.0; UNKNOWNS], &[1.0; UNKNOWNS]);
     let same: Vec<Row> = (rows(400, [2.0, -0.03], 7, 0.1).into_iter())
@@ -152,14 +176,14 @@ fn clustered_intervals_hold_correlated_errors_and_plain_ones_do_not() {
             (row[0], row[1]) = (3.0 * z + e, z);
             blocks.push(frame.reduce(&sum(&[row; 20])));
         }
-        let mut total = [[0.0; UNKNOWNS]; UNKNOWNS];
+        let mut total = frame.reduce(&Gram::default());
         for block in &blocks {
             (0..4).for_each(|k| total[k / 2][k % 2] += block[k / 2][k % 2]);
         }
         let mut found = solve(&total, 0b10, &wide(), 1.0 / 3.0).unwrap();
         let off = (found.x[1] - 3.0).abs();
         plain_inside += i32::from(off < 1.96 * found.covariance[1][1].sqrt());
-        let score = |block: &Matrix| {
+        let score = |block: &Reduced| {
             let mut score = [0.0; UNKNOWNS];
             score[1] = block[1][0] - found.x[1] * block[1][1];
             score

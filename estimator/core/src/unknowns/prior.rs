@@ -1,7 +1,8 @@
 //! What is believed of the unknowns before any data.
 
 use super::{
-    CORNER, DAMPING, DRY, INERTIA, LATE, LOAD, OFFSET, SOFT, SPRING, Scale, Spring, TORQUE_LATE, USUAL, ZERO,
+    CORNER, DAMPING, DRY, ECCENTRIC, INERTIA, LATE, LOAD, OFFSET, SOFT, SPRING, Scale, Spring, TORQUE_LATE,
+    USUAL, ZERO,
 };
 use crate::balance;
 use crate::gram::{Frame, Gram, Prior, UNKNOWNS, inverse, set};
@@ -27,6 +28,10 @@ impl Spring {
             let gear = LOAD.contains(&unknown);
             let share = if gear { priors.load_dependent_friction } else { priors.undeclared };
             std[unknown] = share * torque / rms(unknown);
+        }
+        // Both are believed of it: what an encoder reads wrong, and what an effect makes of a torque.
+        for value in &mut std[ECCENTRIC] {
+            *value = value.recip().hypot(priors.encoder_eccentricity.recip()).recip();
         }
         if self.series {
             std[CORNER.start] = priors.spring * torque / rms(CORNER.start);

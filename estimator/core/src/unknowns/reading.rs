@@ -1,6 +1,6 @@
 //! Torque and stiffness that the unknowns make at a deflection.
 
-use super::{ASYMMETRY, CLIPS, CORNER, LATE, SPRING, STOPS, Spring, ZERO};
+use super::{ASYMMETRY, CLIPS, CORNER, ECCENTRIC, LATE, SPRING, STOPS, Spring, ZERO};
 use crate::balance;
 use crate::balance::Balance;
 use crate::gram::{Set, UNKNOWNS, Vector};
@@ -29,7 +29,9 @@ impl Spring {
     /// `late_s` and `link_rate`: the position that was read late is brought up by them.
     #[must_use]
     pub fn at(&self, phi: f64, x: &Vector, set: Set, link_rate: f64, balance: &Balance) -> Reading {
-        let now = phi + x[LATE] * link_rate;
+        let waves = balance.waves();
+        let eccentric: f64 = x[ECCENTRIC].iter().zip(waves).map(|(x, wave)| x * wave).sum();
+        let now = phi + x[LATE] * link_rate + eccentric;
         let (mut torque, mut stiffness) = self.curve(now);
         let at = now + self.zero;
         let (mut by_torque, mut by_stiffness) = ([0.0; UNKNOWNS], [0.0; UNKNOWNS]);
@@ -55,6 +57,9 @@ impl Spring {
         }
         (by_torque[ZERO], by_stiffness[ZERO]) = (stiffness, bend);
         (by_torque[LATE], by_stiffness[LATE]) = (stiffness * link_rate, bend * link_rate);
+        for (unknown, wave) in ECCENTRIC.zip(waves) {
+            (by_torque[unknown], by_stiffness[unknown]) = (stiffness * wave, bend * wave);
+        }
         if set & (crate::gram::set(STOPS) | crate::gram::set(CLIPS)) != 0 {
             let (more, stiffer) = balance.extras(phi);
             for (unknown, column) in STOPS.zip(balance::STOPS).chain(CLIPS.zip(balance::CLIPS)) {

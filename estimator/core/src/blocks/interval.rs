@@ -1,7 +1,7 @@
 //! The interval: what other explanations may change, what noise in the positions takes off, errors of the model.
 
 use super::Blocks;
-use super::solve::{ALONE, is_causal};
+use super::solve::ALONE;
 use crate::choices::{ALIKE, EVEN, EXACT, FEWEST, UNLIKE};
 use crate::gram::{
     Frame, Gram, Matrix, Posterior, Prior, Reduced, UNKNOWNS, by_prior, cluster, log_evidence, set, solve,
@@ -43,7 +43,8 @@ impl Blocks {
             if probability < EVEN {
                 continue;
             }
-            let Some(other) = solve(reduced, set, prior, noise).filter(is_causal) else { continue };
+            let other = solve(reduced, set, prior, noise);
+            let Some(other) = other.filter(|other| self.impossible(other) == 0) else { continue };
             for i in unknowns(chosen.set) {
                 for j in unknowns(chosen.set) {
                     let moved = (other.x[i] - chosen.x[i]) * (other.x[j] - chosen.x[j]);

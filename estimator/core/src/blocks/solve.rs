@@ -10,7 +10,8 @@ use crate::gram::{
 use crate::laws::{Law, PARAMETERS};
 use crate::spring::Projection;
 use crate::unknowns::{
-    ACTIVE, CANDIDATES, CLIPS, DRY, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, TORQUE_LATE, ZERO,
+    ACTIVE, CANDIDATES, CLIPS, DRY, ECCENTRIC, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, TORQUE_LATE,
+    ZERO,
 };
 
 const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
@@ -322,9 +323,21 @@ impl Blocks {
             let found = choose(reduced, base, groups, self.spring.shape(), prior, noise);
             solve(reduced, found, prior, noise)
         };
-        let late = set(TORQUE_LATE..TORQUE_LATE + 1);
-        let causal = || groups.map(|group| if group == late { 0 } else { group });
-        of(groups).filter(is_causal).or_else(|| of(&causal()))
+        let found = of(groups)?;
+        let wrong = self.impossible(&found);
+        if wrong == 0 {
+            Some(found)
+        } else {
+            of(&groups.map(|group| if group & wrong == 0 { group } else { 0 }))
+        }
+    }
+
+    /// Unknowns whose values no joint has: a torque that is read before it acts, an eccentricity that no mounting leaves.
+    pub(super) fn impossible(&self, found: &Posterior) -> Set {
+        let size = found.x[ECCENTRIC].iter().map(|x| x * x).sum::<f64>().sqrt();
+        let (late, eccentric) = (found.x[TORQUE_LATE] < 0.0, size > self.priors.encoder_eccentricity);
+        let of = |wrong: bool, unknowns| if wrong { found.set & set(unknowns) } else { 0 };
+        of(late, TORQUE_LATE..SOFT) | of(eccentric, ECCENTRIC)
     }
 
     /// Whether a zero that has moved can be told from another curve: one whose law is open only where deflections reach as
@@ -341,11 +354,6 @@ impl Blocks {
 /// Unknowns whose shapes no joint has quite: friction, memory, the free curve.
 fn shaped() -> Set {
     set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS) | set(CLIPS)
-}
-
-/// Whether no torque is read before it acts.
-pub(super) fn is_causal(found: &Posterior) -> bool {
-    found.set >> TORQUE_LATE & 1 == 0 || found.x[TORQUE_LATE] >= 0.0
 }
 
 #[cfg(test)]

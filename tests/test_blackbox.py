@@ -291,3 +291,13 @@ def test_a_box_that_begins_leaves_the_recording_that_another_one_still_writes(tm
     (left := tmp_path / "kept" / "elbow-20260105T081500Z-asked.part").touch()
     Scene(tmp_path)
     assert not left.exists()
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path, monkeypatch, caplog):
+    scene = Scene(tmp_path)
+    scene.run(20)
+    scene.box.keep("asked")
+    monkeypatch.setattr("drivelink.recording.sinks.os.write", full)
+    assert not scene.finish()
+    assert [record.getMessage().count("No space left on device") for record in caplog.records] == [1]
+    assert [path.name for path in (tmp_path / "kept").iterdir()] == ["elbow.day.csv"]

@@ -1,3 +1,5 @@
+import io
+
 import pytest
 from daemonkit import served
 
@@ -115,3 +117,18 @@ def test_the_examples_are_copied_once(tmp_path, capsys):
     assert (tmp_path / "examples" / "close_the_loop.py").exists()
     assert main(["new", "--examples", str(tmp_path)]) == 2
     assert "is there already" in capsys.readouterr().err
+
+
+def test_every_line_that_is_commented_out_is_valid_too(tmp_path):
+    """Removing a `#` gives a joint file, not an error."""
+    text = joint_text(Answers(nodes=[3]))
+    for line in text.splitlines():
+        if line.startswith("# ") and " = " in line and "config" not in line and "eds" not in line:
+            jointfile.parse(text.replace(line, line[2:], 1) if "inertia" not in line else text)
+
+
+def test_questions_left_unanswered_are_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    assert main(["new", str(tmp_path / "elbow.toml")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -189,3 +189,18 @@ def test_three_lines_fit_predict_plot_and_write(fleet, tmp_path):
     assert repr(found) == str(found) and str(found).startswith("The model is sufficient")
     assert found.plot()._repr_png_().startswith(b"\x89PNG")
     assert [path.name for path in found.report(tmp_path)] == ["report.json", "report.html"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {},  # without the friction
+        {"effects": (FRICTION,), "inertia_kg_m2": 0.026},
+        {"effects": (FRICTION,), "transmission": Transmission(model="linear", parameters={"k_nm_rad": 6.0})},
+    ],
+)
+def test_a_wrong_model_fits_worse(wrong):
+    right, worse = (
+        free_run(run(), one, 0.5).fit_percent for one in (joint(effects=(FRICTION,)), joint(**wrong))
+    )
+    assert all(worse[name] < right[name] - 1.0 for name in ("motor1_position", "motor1_deflection"))

@@ -1,6 +1,7 @@
 """The daemon's life: what it publishes, how it starts and ends, another model in the running loop."""
 
 import argparse
+import math
 import os
 import threading
 import time
@@ -24,6 +25,13 @@ from drivelink.errors import UsageError, ZenohError
 from drivelink.jointfile import JointFile, load, load_text, parse
 from drivelink.loop import acceptance
 from estimator.sample import Estimate, Status
+
+LINK = """
+[link.dynamics]
+inertia_kg_m2 = 0.003
+viscous_damping_nm_s_rad = 0.001
+gravity_nm = 0.2943
+"""
 
 
 def daemon(joint: JointFile) -> Daemon:
@@ -403,3 +411,13 @@ def test_two_joints_share_a_bus_and_its_sync_and_what_goes_wrong_beside_the_cycl
             "frame 0x181: KeyError",
         ):
             assert text in said
+
+
+def test_the_status_has_the_external_torque_where_the_link_is_declared():
+    with rig() as made:
+        made.run(10)
+        assert made.status["external"] is None
+    with rig(parse(vsa_text() + LINK)) as made:
+        made.run(10)
+        begin = made.status["external"]
+        assert (begin["valid"], begin["contact"]) == (False, False) and math.isnan(begin["torque_nm"])

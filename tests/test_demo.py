@@ -5,6 +5,7 @@ import itertools
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -160,3 +161,12 @@ def interrupted(*options: str, valid_lines: int) -> str:
     with pytest.raises(ProcessLookupError):  # nothing is left running
         until(lambda: os.killpg(process.pid, 0))
     return out
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_demo_with_its_results():
+    out = interrupted("--headless", "--case", "constant", valid_lines=1)
+    assert "truth beside estimate" in out
+    assert "relative to the truth's rms" in out and "held the truth in" in out and "…" not in out
+    errors = [float(number) for number in re.findall(r"([\d.]+) % │", out)]
+    assert len(errors) == 2 and max(errors) < 3.0

@@ -18,6 +18,19 @@ from drivelink.doctor.livevalues import LiveValues, Readings, Series
 from drivelink.doctor.manualcheck import ByHand, Value, check_by_hand
 from drivelink.jointfile import JointFile, load, parse
 
+
+def once(ask: Callable[..., str], start: str, then: str) -> Callable[..., str]:
+    """`ask`, which answers otherwise when it is asked a second time."""
+    asked = []
+
+    def answer(text: str, meanwhile: Callable[[], object]) -> str:
+        asked.append(text)
+        again = text.startswith(start) and asked.count(text) > 1
+        return then if again else ask(text, meanwhile)
+
+    return answer
+
+
 JOINT = """
 name = "elbow"
 arrangement = "{arrangement}"
@@ -41,9 +54,9 @@ counts_per_rev = 4096.0
 """
 
 
-def joint(arrangement: str = "single", gear: float = 1.0) -> JointFile:
+def joint(arrangement: str = "single", gear: float = 1.0, axis: str = "rotary") -> JointFile:
     more = "" if arrangement == "single" else SECOND
-    return parse(JOINT.format(arrangement=arrangement, gear=gear, more=more))
+    return parse(f'axis = "{axis}"\n' + JOINT.format(arrangement=arrangement, gear=gear, more=more))
 
 
 class HandMovedJoint:
@@ -237,3 +250,18 @@ def test_a_reading_is_as_uncertain_as_its_count_and_two_counts_are_no_reaction_t
     done = check_by_hand(joint(), rig, rig)
     (mark,) = (mark for mark in done.marks if mark.channel == "motor1_torque")
     assert mark.good is None and "no reaction" in mark.text and "motor1_torque" not in done.needed
+
+
+def test_a_linear_axis_is_moved_in_millimetres_and_pushed_in_newtons():
+    rig = HandMovedJoint({})
+    done = check_by_hand(joint(axis="linear"), rig, rig)
+    assert done.good and done.paste == []
+    assert any("+51 mm (+0.051) for +50 mm (+0.05)" in line for line in rig.said)
+    assert any("-1.5 N against the push" in line for line in rig.said)
+    rig = HandMovedJoint({"link_position": 1e3}, {"Move": "0.051 m"})  # counts taken for millimetres
+    done = check_by_hand(joint(axis="linear"), rig, rig)
+    assert done.paste == ["link.encoder.counts_per_rev = 6.5536e+07"]
+    rig = HandMovedJoint({}, {"Move": "90 deg"})
+    rig.ask = once(rig.ask, "Move", "51")  # type: ignore[method-assign]
+    assert check_by_hand(joint(axis="linear"), rig, rig).good
+    assert "expected an amount like 50 or 0.2 m, got 90 deg" in rig.said

@@ -1,5 +1,7 @@
 """Batch fits of whole recordings: known truth found again, with intervals that mean something."""
 
+import json
+
 import diagnosiskit as kit
 import fleetkit
 import joints
@@ -8,6 +10,7 @@ import pytest
 import simjoints
 
 from drivelink import jointfile
+from drivelink.cli import main
 from drivelink.output import plots
 from drivelink.output.fitreport import fit_plot
 from estimator import EstimatorError, JointModel, LinkDynamics, Motor, Record, Status, Transmission, fit
@@ -192,3 +195,32 @@ def test_the_spring_of_a_serial_joint_bears_on_the_motor_that_sets_its_lever():
     carrying, setting = fit(record, JointModel(arrangement="serial", motors=declared, link=link))
     assert abs(carrying.alpha[0] - 150.0) < 1.0
     assert setting.error_rms_nm < 0.001 * setting.torque_rms_nm
+
+
+def test_command_writes_json_plots_and_a_joint_file_that_loads(elbow, tmp_path, capsys):
+    plants, alpha, truth = elbow
+    joints.write_csv(_record(truth, 2), tmp_path / "run.csv")
+    joint, target, out = tmp_path / "joint.toml", tmp_path / "fitted.toml", tmp_path / "out"
+    joint.write_text(
+        f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = {plants.B[2, 0]}  # from the drawing\n'
+        f'viscous_damping_nm_s_rad = {plants.D[2, 0]}\n[motor.transmission]\nmodel = "polynomial"\norder = 2\n'
+    )
+    args = ["fit", str(tmp_path / "run.csv"), "--joint", str(joint), "--out"]
+    assert main([*args, str(out), "--plots", "--write", str(target)]) == 0
+    (entry,) = json.loads((out / "fit.json").read_text())["transmissions"]
+    found = entry["parameters"]["coefficients_nm_rad"]
+    assert (entry["model"], set(entry["std"])) == ("polynomial", {"coefficients_nm_rad"})
+    assert found == pytest.approx(alpha[2].tolist(), rel=2e-2)
+    assert found[0] == pytest.approx(alpha[2][0], rel=1e-3)
+    assert (out / "fit.png").stat().st_size > 1000
+    written = jointfile.load(target)
+    assert written.motor[0].transmission.parameters["coefficients_nm_rad"] == pytest.approx(found)
+    assert "from the drawing" in target.read_text()
+    assert written.provenance["fit"]["recording"] == "run.csv"
+    capsys.readouterr()
+    # A result is printed before any file is written: what cannot be written takes nothing else with it.
+    (tmp_path / "taken").write_text("a file")
+    joints.write_csv(joints.part(_record(truth, 2), slice(3000)), tmp_path / "run.csv")
+    assert main([*args, str(tmp_path / "taken" / "out")]) != 0
+    said = capsys.readouterr()
+    assert "torque balance" in said.out and "taken" in said.err and said.err.count("\n") == 1

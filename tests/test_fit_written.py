@@ -22,7 +22,9 @@ import pytest
 from drivelink import jointfile, recording
 from drivelink.cli import main
 from drivelink.errors import JointFileError
-from estimator import fit
+from drivelink.output.fitreport import _effects
+from drivelink.output.numbers import Units
+from estimator import Effect, fit
 from estimator.identify import identify
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -236,3 +238,9 @@ def test_on_a_machine_the_fitted_file_makes_its_recordings_valid(run, tmp_path):
         record = recording.read(KUKA / f"axis3_{other}.csv", joint)
         status = joints.estimates(joint.model(), record)[:, 1].astype(int)
         assert np.mean(status & 1) > 0.8  # a few of a hundred without the fit's residual
+
+
+def test_an_effect_that_was_fitted_is_printed_with_its_interval():
+    effect = Effect(name="deflection_offset", parameters={"offset_rad": 1.3e-5}, std={"offset_rad": 4.6e-5})
+    (row,) = _effects((effect,), Units(False))
+    assert row == ("deflection_offset.offset_rad", "1.3e−5", "9.0e−5", "rad")

@@ -15,6 +15,7 @@ from fleetkit import row
 
 pytest.importorskip("distributed", reason="the extra [fleet] is not installed")
 
+import chromium
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -23,6 +24,17 @@ from drivelink.fleet.page import page
 from drivelink.fleet.storage import FleetError, Source, Store
 from drivelink.fleet.summary import COLUMNS, summarise
 from drivelink.fleet.table import FleetTable, read_rows
+
+CUT = "[...document.querySelectorAll('figure, .table')].filter(e => e.scrollWidth > e.clientWidth).length"
+
+
+SMALLEST = """Math.min(...[...document.querySelectorAll('.large text')].filter(e => e.getClientRects().length)
+.map(e => parseFloat(getComputedStyle(e).fontSize) * e.getScreenCTM().a))"""
+
+
+SHOWN = """[...document.querySelectorAll('.joints tr')].filter(row => row.offsetHeight)
+.sort((a, b) => a.offsetTop - b.offsetTop).map(row => row.querySelector('th').textContent)"""
+
 
 # The table
 
@@ -261,3 +273,49 @@ def test_the_table_is_data_on_the_page(report):
     assert report not in text and "<script" not in text
     assert f'href="{good}"' in text
     assert "Content-Security-Policy" in text and "default-src 'none'" in text
+
+
+def test_a_linear_axis_has_metres_and_newtons():
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) | {"axis": "linear"} for k in range(10)]
+    text = page(summarise(rows, 0.05))
+    assert "at a deflection of 0.02 m, N/m; scatter" in text and "viscous damping, N·s/m<" in text
+    assert "N·m" not in text and " rad" not in text
+
+
+def test_a_stiffness_that_says_nothing_at_the_common_deflection_is_no_point():
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
+    rows[4] |= {"covariance": [80.0**2]}
+    (joint,) = summarise(rows, 0.05)["joints"]
+    assert len(joint["transmissions"][0]["series"]) == 9
+    assert [one["reason"] for one in joint["unusable"]] == ["its motion does not reveal the stiffness"]
+
+
+def test_what_the_last_recordings_agree_on_is_said_with_the_day_since_which_they_do():
+    found = {
+        "verdict": "effect",
+        "effects": ["coulomb_friction@motor1"],
+        "sentence": "The model lacks Coulomb friction.",
+    }
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) | (found if k >= 9 else {}) for k in range(12)]
+    last = "The last 3 of 12 recordings, since 2026-01-14, agree: The model lacks Coulomb friction."
+    assert sentence(*rows) == last
+    assert sentence(*rows[:10]).startswith("No significant change, but the last recording says: ")
+
+
+@pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
+def test_a_phone_shows_charts_and_tables_whole_and_joints_are_sorted_and_hidden(tmp_path):
+    rows = [
+        night("wrist", k, 150.0 + 4.0 * (k >= 12), ["coulomb_friction@motor"] if k >= 9 else [])
+        for k in range(20)
+    ] + [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(20)]
+    (tmp_path / "fleet.html").write_text(page(summarise(rows, 0.05)), encoding="utf-8")
+    with chromium.Chromium(tmp_path / "profile") as browser:
+        browser.resize(390, 800)
+        browser.open((tmp_path / "fleet.html").as_uri())
+        assert browser.evaluate(CUT) == 0
+        assert browser.evaluate(SMALLEST) > 8.0  # letters that can be read
+        assert browser.evaluate(SHOWN) == ["wrist", "elbow"]  # by urgency
+        browser.evaluate("document.getElementById('by1').click()")
+        assert browser.evaluate(SHOWN) == ["elbow", "wrist"]  # by name
+        browser.evaluate("document.getElementById('show-steady').click()")
+        assert browser.evaluate(SHOWN) == ["wrist"]

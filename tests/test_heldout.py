@@ -14,7 +14,7 @@ from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
-from estimator.harm import Unseen, harm, harm_of_parts
+from estimator.harm import Unseen, _Figure, harm, harm_of_parts
 from estimator.identify import identify
 from estimator.model import JointModel, Transmission
 from estimator.model_monitor import measure_baseline
@@ -240,3 +240,11 @@ def test_a_deflection_that_a_law_cannot_have_is_an_error_that_says_so(healthy):
     far = replace(record, motor_position_rad=1e6 * record.motor_position_rad)
     with pytest.raises(EstimatorError, match="more than a transmission of model"):
         identify(far, replace(linear, motors=(own,)))
+
+
+def test_what_is_quoted_is_what_was_judged():
+    """One block that falls outweighs in the mean square the nine that rise."""
+    figure = _Figure(np.array([1.0] * 9 + [100.0]), np.array([4.0] * 9 + [25.0]))
+    assert figure.rises(1e-6)
+    written, declared = figure.roots(1e-6)
+    assert written > declared

@@ -26,7 +26,7 @@ from drivelink.errors import JointFileError, RecordingError, UsageError
 from drivelink.loop import acceptance, diagnosing, finding
 from drivelink.loop.feed import FindingFeed
 from drivelink.loop.finding import finding_file, proposal_file
-from drivelink.loop.queue import Diagnoses, next_due
+from drivelink.loop.queue import Diagnoses, _of_process, next_due
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import WebView, snapshot
@@ -423,3 +423,28 @@ def test_only_the_page_itself_can_accept(friction, tmp_path):
     finally:
         allowed.close()
         forbidden.close()
+
+
+def test_a_diagnosis_that_waits_for_the_processors_says_so(tmp_path, monkeypatch):
+    (made,) = touch(tmp_path, "081500Z-model-alarm")
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: SimpleNamespace(poll=lambda: None, pid=1))
+    diagnoses, now_s, said = Diagnoses(tmp_path, "elbow"), 100.0, []
+    monkeypatch.setattr("drivelink.loop.queue.time.monotonic", lambda: now_s)
+    cpu_s = 0.0
+    for second in range(60):
+        state, gains = [("R", 0.01), ("R", 0.9), ("S", 0.0)][second // 20]
+        now_s, cpu_s = now_s + 1.0, cpu_s + gains
+        monkeypatch.setattr("drivelink.loop.queue._of_process", lambda _, one=(state, cpu_s): one)
+        diagnoses.step()
+        said.append(finding.line(finding.read(made) or {}))
+    waits = "diagnosis waits: processors busy since 10 s"
+    assert said[5] == said[-1] == "what the model may lack is being looked for"
+    assert waits in said[12] and waits not in said[25] and len(set(said)) == 2
+    assert _of_process(os.getpid())[0] == "R"
+    # A process that has said what it found ends late, too: that finding stays.
+    finding.write(made, finding.begun(made, finding.NOTHING, "the model is sufficient"))
+    monkeypatch.setattr("drivelink.loop.queue._of_process", lambda _: ("R", cpu_s))
+    for _ in range(20):
+        now_s += 1.0
+        diagnoses.step()
+    assert finding.line(finding.read(made)) == "the model is sufficient"

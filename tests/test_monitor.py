@@ -22,7 +22,7 @@ from rich.console import Console
 from drivelink import cli
 from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
 from drivelink.monitor.statuslines import shape, status_lines
-from drivelink.monitor.terminal import joints_table
+from drivelink.monitor.terminal import can_draw, joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.web import snapshot
 from drivelink.output.numbers import number, with_interval
@@ -346,3 +346,39 @@ def test_several_joints_are_one_line_each_and_no_column_is_cut_off():
         shown = lines(joints_table({"elbow": filled(), "wrist": gone, "far": far}, width), width)
         assert len(shown) == 4 and "daemon gone" in "".join(shown)
         assert all(len(line) <= width and "…" not in line for line in shown), shown
+
+
+def test_without_a_bus_no_node_is_operational_and_what_several_nodes_lack_is_said_once():
+    view = filled()
+    view.status = view.status | {
+        "state": "bus lost",
+        "conditions": [f"node {k}: frames are missing" for k in (1, 2)],
+    }
+    text = "\n".join(lines(view, 120, 40))
+    assert "1 not heard" in text and "operational" not in text
+    assert "nodes 1, 2: frames are missing" in text
+
+
+def test_an_error_of_the_valid_cycles_does_not_stand_beside_an_estimate_that_is_not():
+    view = filled(truth=True)
+    last = estimate(5000, status=0)
+    view.update(last, 5.0, Truth(last[2], last[3]))
+    assert "truth" in "\n".join(lines(view)) and " error " not in "\n".join(lines(view)) + view.line()
+
+
+def test_a_live_view_needs_a_terminal_with_its_characters():
+    for encoding, able in (("utf-8", True), ("ascii", False), ("latin-1", False)):
+        file = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+        assert can_draw(Console(file=file, force_terminal=True)) is able
+        assert not can_draw(Console(file=file, force_terminal=False))
+
+
+@pytest.mark.parametrize(
+    ("watching", "why"), [(True, "its filters are settling"), (False, "no baseline: drivelink fit")]
+)
+def test_a_residual_without_gauge_is_not_always_one_without_baseline(watching, why):
+    view = filled()
+    view.status = {"residual_nm": 0.0, "residual_alarm": {"active": watching, "watching": watching}}
+    assert "0.00 N·m" not in f"{view.line()}{lines(view)}"  # there is none
+    assert snapshot(view, True, {})["status"]["no_gauge"].startswith(why)
+    assert why in "\n".join(lines(view, 120, 40))

@@ -159,3 +159,16 @@ def test_the_container_installs_the_lock_and_runs_the_demo():
         "--require-hashes -r .ci/requirements-run.txt" in text and "--no-deps --no-build-isolation ." in text
     )
     assert text.rstrip().endswith('ENTRYPOINT ["drivelink"]\nCMD ["demo"]') and "USER nobody" in text
+
+
+@pytest.mark.slow  # it makes an environment
+def test_the_audit_without_a_network_is_one_line():
+    offline = os.environ | {"PIP_INDEX_URL": "http://127.0.0.1:9/", "PIP_RETRIES": "0"}
+    done = subprocess.run(
+        ["sh", ROOT / ".ci/audit"], env=offline, capture_output=True, text=True, check=False
+    )
+    assert (
+        done.returncode == 1
+        and done.stderr.startswith("nothing was examined")
+        and done.stderr.count("\n") == 1
+    )

@@ -10,7 +10,7 @@ import pytest
 from onlinekit import PERIOD_S, declared, motion
 
 from estimator import EstimatorError, EstimatorSettings, Sample, Status, make_estimator
-from estimator.reasons import CHANGES, REASONS, why_not_valid
+from estimator.reasons import CHANGES, REASONS, reason_text, why_not_valid
 
 CORE = Path(__file__).parent.parent / "estimator" / "core" / "src"
 
@@ -108,3 +108,13 @@ def test_a_rigid_joint_is_valid_while_its_balance_is_explained(factor, valid):
     said = [bool(estimator.step(sample).status & Status.VALID) for sample in drawn.record.samples()]
     assert set(said[len(said) // 2 :]) == {valid}
     assert (estimator.why() or ("",))[0] == ("" if valid else "unexplained")
+
+
+def test_the_sentences_are_those_of_the_documentation():
+    assert reason_text("imprecise", share=0.44, asked=0.2) == "stiffness known to ± 44 %, asked for ± 20 %"
+    assert (
+        reason_text("imprecise", share=0.2004, asked=0.2) == "stiffness known to ± 20.04 %, asked for ± 20 %"
+    )
+    text = reason_text("changed", motor=2, changes=["torque_scale", "stiffness"])
+    assert text == "motor 2: torque gain or stiffness has changed"
+    assert reason_text("changed") == "the joint has changed"

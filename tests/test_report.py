@@ -16,8 +16,10 @@ from rich.console import Console
 from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.jointfile.apply_diagnosis import floor_entry, make_model_monitor
-from drivelink.output import plots, progress
-from drivelink.output.plots import PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
+from drivelink.output import plots, progress, report
+from drivelink.output.document import Grid, Section, show
+from drivelink.output.numbers import Units
+from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
 from drivelink.output.progress import Meter
 from estimator.sample import Record
 
@@ -203,3 +205,72 @@ def test_long_work_on_a_terminal_is_a_bar_that_goes_away_also_where_it_breaks_of
     assert "fit" in text(shown) and "40/100" in text(shown)
     assert text(shown).rstrip().endswith("\x1b[2K")  # the line is erased
     assert "\x1b[?25h" in text(shown)  # the cursor is back
+
+
+@pytest.mark.parametrize(("chosen", "said"), [(0.02, True), (0.005, False)])
+def test_the_report_says_why_another_effect_was_not_chosen(chosen, said):
+    rival = SimpleNamespace(name="asymmetric_friction", error_relative=0.01)
+    outcome = SimpleNamespace(train=SimpleNamespace(after_relative=chosen), rivals=[rival])
+    why = "asymmetric friction alone leaves less: an effect with more freedom"
+    assert (why in report._choice_of(outcome, [chosen])) == said
+
+
+@pytest.mark.slow
+def test_of_a_linear_axis_the_report_speaks_of_newtons_and_metres(folder):
+    (folder / "slide.toml").write_text(JOINT.replace("[[motor]]", 'axis = "linear"\n[[motor]]', 1))
+    _diagnose(folder, "coulomb", "slide.toml")
+    page = (folder / "coulomb-slide.toml" / "report.html").read_text(encoding="utf-8")
+    assert re.search(r"<th>torque_<wbr>nm</th><td>\S+</td><td>\S+</td><td>N</td>", page)
+    assert re.search(r"<th>k_<wbr>nm_<wbr>rad</th><td>\S+</td><td>\S+</td><td>N/m</td>", page)
+    assert "N·m" not in page and "/ rad" not in page and "m/s" in page
+
+
+def test_every_coefficient_of_a_polynomial_has_its_unit():
+    text = Units(linear=False).value("coefficients_nm_rad", tuple(float(k) for k in range(1, 9)), None)
+    units = ["rad", "rad³", "rad⁵", "rad⁷", "rad⁹", "rad¹¹", "rad¹³", "rad¹⁵"]
+    assert text == ", ".join(f"{k} N·m/{unit}" for k, unit in enumerate(units, start=1))
+
+
+@pytest.mark.parametrize("columns", [60, 80])  # in 40 it is a list
+def test_a_printed_table_keeps_every_letter_in_a_narrow_terminal(columns):
+    names = ("viscous_damping_nm_s_rad", "coefficients_nm_rad[2]")
+    grid = Grid(
+        ("where they differ most", "at", "of A", "of B"),
+        [(name, "−0.0147 rad/s", "140.00 N·m/rad", "–") for name in names],
+    )
+    console = Console(width=columns, file=io.StringIO(), record=True)
+    show([Section("", [grid])], console)
+    lines = console.export_text().splitlines()
+    first = "".join(line[1:].split("│")[0].strip() for line in lines if line.startswith("│"))
+    assert first == "".join(names) and max(map(len, lines)) <= columns
+
+
+def test_curves_differ_in_line_style_marker_and_lightness_not_only_in_colour():
+    _, (axes,) = new_figure()
+    t, phi, _ = wave(100)
+    over_time(axes, {name: PlotCurve(t, k + phi) for k, name in enumerate("abcdef")}, "y")
+    looks = [(line.get_linestyle(), line.get_marker()) for line in axes.lines]
+    assert len(set(looks)) == len(looks) == 6
+    rgb = [[int(color[i : i + 2], 16) for i in (1, 3, 5)] for color in COLORS[:3]]
+    lightness = sorted(np.array(rgb) @ (0.2126, 0.7152, 0.0722))
+    assert np.diff(lightness).min() > 20
+
+
+def test_thinning_loses_no_peak():
+    t = np.arange(300_000) * 1e-3
+    y = np.zeros_like(t)
+    y[123_456] = 7.0
+    _, (axes,) = new_figure()
+    over_time(axes, {"a": PlotCurve(t, y)}, "y")
+    assert len(axes.lines[0].get_xdata()) < 5000 and max(axes.lines[0].get_ydata()) == 7.0
+
+
+@pytest.mark.parametrize("suffix", [".svg", ".png"])
+def test_the_same_data_are_the_same_file(suffix, tmp_path):
+    contents = []
+    for name in ("a", "b"):
+        figure, (axes,) = new_figure("t")
+        t, phi, _ = wave(200)
+        over_time(axes, {"φ": PlotCurve(t, phi)}, "φ / rad")
+        contents.append(save(figure, tmp_path / f"{name}{suffix}").read_bytes())
+    assert contents[0] == contents[1]

@@ -100,3 +100,9 @@ def test_a_registered_model_with_two_shape_parameters_is_estimated_on_line(quint
 def test_wrong_names_and_values_are_reported(model, parameters):
     with pytest.raises(EstimatorError):
         transmission_model(Transmission(model=model, parameters=parameters))
+
+
+@pytest.mark.parametrize("name", ALPHAS)
+def test_parameters_go_over_names_and_back(name):
+    model = MODELS[name]
+    assert model.alpha(model.parameters(ALPHAS[name])) == pytest.approx(ALPHAS[name])

@@ -6,6 +6,7 @@ import urllib.error
 import urllib.request
 from contextlib import suppress
 
+import chromium
 import pytest
 import zenohkit
 
@@ -14,6 +15,17 @@ from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import MAX_STREAMS, WebView
 from drivelink.monitor.webserver import MAX_CONNECTIONS
 from drivelink.pubsub.session import close_session, open_client
+
+BLUE = """(() => { const c = document.getElementById('torqueplot');
+const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+let n = 0; for (let i = 0; i < d.length; i += 4) if (d[i + 3] > 200 && d[i + 2] - d[i] > 80) n++;
+return n > 100 ? n : 0; })()"""
+
+
+WIDE = "[...document.querySelectorAll('.numbers dl')].filter(d => d.scrollWidth > d.clientWidth).length"
+
+
+SAVE = "HTMLAnchorElement.prototype.click = function() { saved = this.href; }; $('save').click()"
 
 
 def get(url, host=None):
@@ -130,3 +142,34 @@ def test_streams_that_stay_open_do_not_fill_the_page(web):
     assert get(web.url)[0] == 200
     for connection in held:
         connection.close()
+
+
+@pytest.mark.slow  # what the page does with what it gets: test_web_page.py
+@pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
+def test_the_page_draws_live_plots_in_a_browser(web, polling, tmp_path):
+    with chromium.Chromium(tmp_path / "profile") as browser:
+        browser.open(web.url)
+        browser.wait_for("document.getElementById('stiffness').textContent === '700.0'")
+        assert browser.wait_for("document.getElementById('state').textContent") == "running"
+        for width in (390, 800, 1200):  # no number reaches into the next one
+            browser.resize(width, 900)
+            assert browser.evaluate(WIDE) == 0
+            assert (
+                browser.evaluate("new Set(['measured', 'save', 'pause'].map(id => $(id).offsetTop)).size")
+                == 1
+            )
+        browser.wait_for(BLUE)  # the curve
+        browser.screenshot(tmp_path / "page.png")
+        assert (tmp_path / "page.png").stat().st_size > 20_000
+        # the motor signals: subscribed to while they are shown, and saved with the rest
+        subscribed = lambda: [n for n, _ in web._watcher._streams if n in ("estimate", "sample")]  # noqa: E731
+        assert subscribed() == ["estimate"]
+        browser.evaluate("$('measured').click()")
+        browser.wait_for("joints.elbow.signals.length > 9 && $('motortorque').shown.series[0].length > 9")
+        assert subscribed() == ["estimate", "sample"]
+        browser.evaluate(SAVE)
+        head, *rows = browser.evaluate("decodeURIComponent(saved)").removeprefix("data:text/csv,").split()
+        columns = "time_s,flexibility_torque_nm,stiffness_nm_rad,stiffness_std_nm_rad,valid,motor1_t"
+        assert head.startswith(columns) and any(row.endswith("1.5,0.5,0,0.25") for row in rows)
+        browser.evaluate("$('measured').click()")
+        zenohkit.until(lambda: subscribed() == ["estimate"])

@@ -11,6 +11,7 @@ import pytest
 
 from drivelink.monitor.view import JointView
 from drivelink.monitor.web import snapshot
+from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Status, TransmissionEstimate
 
 NODE = shutil.which("node")
@@ -159,3 +160,45 @@ def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers():
     assert flags == ["flag red"] and number_style == "past"
     assert gauges and hidden and rows == 0
     assert "operational" not in events and "node 2 reports a fault" in events  # what led to it stays
+
+
+def test_undo_stays_on_the_page_when_a_newer_finding_has_come():
+    assert page(
+        """
+        const hidden = (state, undoable) => {
+          showFinding({ finding: { state, sentence: "", cause: "", since: null, recording: "", error: [], details: [] },
+                        acceptable: true, undoable });
+          return document.getElementById("undo").hidden;
+        };
+        return [hidden("proposed", false), hidden("accepted", true), hidden("diagnosing", true)];
+        """
+    ) == [True, False, False]
+
+
+def test_a_finding_that_proposes_nothing_says_so_in_words():
+    about = page(
+        """
+        showFinding({ finding: { state: "nothing", sentence: "", cause: "asked", since: null, recording: "", error: [], details: [] } });
+        return shown("about");
+        """
+    )
+    assert about == "nothing to accept · asked"
+
+
+def test_the_axis_of_the_external_torque_fits_its_band():
+    view = fed()
+    for k in range(4000):
+        torque_nm = 1e-3 * math.sin(2e-3 * k)
+        view.update_external(ExternalMessage(k, k * 1_000_000, 1, torque_nm, 0.01), 1e-3 * k)
+    span = SPAN.replace("torqueplot", "externalplot")
+    low, high, height = page(span + "return [Y(-0.0196), Y(0.0196), B - T];", view)
+    assert 0.7 * height < low - high < height
+
+
+def test_an_external_torque_that_is_not_valid_has_no_unit():
+    view = fed()
+    view.update_external(ExternalMessage(4000, 4_000_000_000, 0, math.nan, math.nan), 4.0)
+    assert page("take(sent[0]); return [shown('external'), $('externalunit').hidden];", view) == [
+        "not valid",
+        True,
+    ]

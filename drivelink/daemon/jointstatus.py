@@ -162,7 +162,7 @@ class JointStatus:
     def _suspicion(self) -> dict[str, Any] | None:
         """Return the reading that the estimator suspects; one that jumps while frames come late is late."""
         found = self._loop_joint.pipeline.estimator.suspicion()
-        late = next((text for key, text in self._events.active.items() if LATE_FRAMES.match(key)), None)
+        late = next((text for key, text in self._events.active.items() if key.startswith(LATE_FRAMES)), None)
         if found is None or found["reason"] != "jumped" or late is None:
             return found
         reading = found["text"].partition(":")[0]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 from collections.abc import Callable
 from typing import Any
 
@@ -166,9 +165,11 @@ _COUNTED = (  # counter of a node; its smallest reported increase, and the messa
 )
 
 
-LATE_FRAMES = re.compile(
-    r"missing |conflicting |too slow"
-)  # conditions in which a reading may be an older one
+LATE_FRAMES = (
+    "missing ",
+    "conflicting ",
+    "too slow",
+)  # what conditions begin with whose readings may be older ones
 _BUNCHED = (
     "some frames are missing, others come several in one cycle and are not used: "
     "this machine or the bus is too slow for the cycle, or another device has its node id"

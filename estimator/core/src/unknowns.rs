@@ -328,15 +328,11 @@ impl Spring {
         let slope = self.slope(projection);
         let moved = projection.of(|phi| self.law.at(phi + self.zero, alpha).1);
         place(&mut frame.directions[ZERO], &moved, 1.0);
-        let signals =
-            [balance::LATE, balance::SINE, balance::COSINE].map(|columns| late(&slope, columns.start));
-        for (unknown, direction) in [LATE].into_iter().chain(ECCENTRIC).zip(signals) {
-            frame.directions[unknown] = direction;
+        let of_link = [balance::LATE, balance::SINE, balance::COSINE];
+        for (unknown, columns) in [LATE].into_iter().chain(ECCENTRIC).zip(of_link) {
+            frame.directions[unknown] = late(&slope, columns.start);
         }
-        frame.set = set(1..UNKNOWNS);
-        for unknown in SPRING.skip(self.size) {
-            frame.set &= !(1 << unknown);
-        }
+        frame.set = set(1..UNKNOWNS) & !set(SPRING.start + self.size..SPRING.end);
         if !self.series {
             frame.set &= !set(CORNER);
         }

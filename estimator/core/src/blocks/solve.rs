@@ -156,6 +156,12 @@ impl Blocks {
         }
     }
 
+    /// What the positions' noise adds to the products of the spring's columns.
+    fn noise_of_columns(&self, total: &Gram) -> Gram {
+        let of_u = self.readings.deflection / self.deflection.powi(2);
+        total.noise(balance::SPRING, balance::SLOPE.start, of_u)
+    }
+
     /// The unknowns from all blocks.
     pub(super) fn solve(&mut self) {
         let mut total = Gram::default();
@@ -169,11 +175,10 @@ impl Blocks {
         let Some(projection) = self.projection.clone() else { return };
         let near = self.priors.deflection_offset * self.deflection + self.readings.resolution;
         let zero = if self.lost { self.deflection } else { near };
-        let noise = self.readings.deflection / self.deflection.powi(2);
-        let noise = total.noise(balance::SPRING, balance::SLOPE.start, noise);
+        let of_columns = self.noise_of_columns(&total);
         for step in 0..STEPS {
             let frame = self.spring.frame(&projection);
-            let reduced = frame.reduce_noisy(&total, &noise);
+            let reduced = frame.reduce_noisy(&total, &of_columns);
             let prior = self.prior(&total, &frame, zero);
             if step == 0 {
                 let elsewhere = self.prior(&total, &frame, self.deflection);
@@ -326,10 +331,9 @@ impl Blocks {
         let found = of(groups)?;
         let wrong = self.impossible(&found);
         if wrong == 0 {
-            Some(found)
-        } else {
-            of(&groups.map(|group| if group & wrong == 0 { group } else { 0 }))
+            return Some(found);
         }
+        of(&groups.map(|group| if group & wrong == 0 { group } else { 0 }))
     }
 
     /// Unknowns whose values no joint has: a torque that is read before it acts, an eccentricity that no mounting leaves.

@@ -20,11 +20,7 @@ BLUE = """(() => { const c = document.getElementById('torqueplot');
 const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
 let n = 0; for (let i = 0; i < d.length; i += 4) if (d[i + 3] > 200 && d[i + 2] - d[i] > 80) n++;
 return n > 100 ? n : 0; })()"""
-
-
 WIDE = "[...document.querySelectorAll('.numbers dl')].filter(d => d.scrollWidth > d.clientWidth).length"
-
-
 SAVE = "HTMLAnchorElement.prototype.click = function() { saved = this.href; }; $('save').click()"
 
 
@@ -146,8 +142,8 @@ def test_streams_that_stay_open_do_not_fill_the_page(web):
 
 @pytest.mark.slow  # what the page does with what it gets: test_web_page.py
 @pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
-def test_the_page_draws_live_plots_in_a_browser(web, polling, tmp_path):
-    with chromium.Chromium(tmp_path / "profile") as browser:
+def test_the_page_draws_live_plots_in_a_browser(web, tmp_path):
+    with zenohkit.repeated(web.poll, 0.02), chromium.Chromium(tmp_path / "profile") as browser:
         browser.open(web.url)
         browser.wait_for("document.getElementById('stiffness').textContent === '700.0'")
         assert browser.wait_for("document.getElementById('state').textContent") == "running"

@@ -16,6 +16,7 @@ from estimator.diagnosis import diagnose
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
+UW = ("DoubleLoopDisturbance", "InnerLoop")
 pytestmark = pytest.mark.skipif(
     not (DATA / "emps" / "train.csv").exists(), reason=f"no measured data in {DATA} (see $DRIVELINK_DATA)"
 )
@@ -43,6 +44,19 @@ def test_kuka_axes_have_friction_and_get_better_on_the_other_recording(axis, lim
     assert found.validation.after_relative < limit  # thirty lines of least squares: 23.7 % and 35.0 %
     assert found.validation.after_rms_nm < found.validation.before_rms_nm
     assert any("friction" in effect.name for effect in found.effects)
+
+
+def test_a_motor_that_rests_half_of_the_time_does_not_hide_the_friction():
+    """Its velocity is moved within its noise, however large the torque; by more, friction explains anything."""
+    joint = jointfile.parse(
+        'name = "uw_sea"\narrangement = "single"\n[bus]\nperiod_s = 0.005\n[[motor]]\ninertia_kg_m2 = 5.878e-4\n'
+        'viscous_damping_nm_s_rad = 0.0\ntransmission = { model = "linear" }\n'
+    )
+    train, other = (recording.read(DATA / "uw_sea" / f"uw_{name}.csv", joint) for name in UW)
+    found = diagnose(train, joint.model(), 10.0, other)
+    assert found.validation.after_relative < 0.416  # thirty lines of least squares
+    (spring,) = found.transmissions
+    assert abs(spring.parameters["k_nm_rad"] - 0.462) < 1.96 * spring.std["k_nm_rad"]  # its authors'
 
 
 @pytest.mark.parametrize(("name", "least"), [("A", 0.2), ("B", 0.4)])

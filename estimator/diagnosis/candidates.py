@@ -173,7 +173,7 @@ def _rubbing(frame: Frame, motor: int) -> Coordinates:
     if key not in frame.memo:
         held = here.flexibility_torque - frame.motor_balance(motor)
         noise = choice("sure") * frame.signals.velocity_noise(motor)
-        frame.memo[key] = here.velocity + noise * held / max(_rms(held), 1e-300)
+        frame.memo[key] = here.velocity + noise * np.clip(held / max(_rms(held), 1e-300), -1.0, 1.0)
     return here._replace(velocity=frame.memo[key])
 
 

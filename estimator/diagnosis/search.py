@@ -28,7 +28,7 @@ from estimator.sample import FloatArray
 
 __all__ = ["Progress", "Search"]
 
-_SMOOTHING, _PERIODS = "smoothing_rad_s", "periods_per_rev"
+_SMOOTHING, _PEAK, _PERIODS = "smoothing_rad_s", "stribeck_velocity_rad_s", "periods_per_rev"
 
 Progress = Callable[[str], None]
 
@@ -216,7 +216,7 @@ class Search:
         return None
 
     def _grown(self, parent: Fitted, term: Term) -> Fitted:
-        """Add one effect; from several starts, as the smoothing of friction and a long delay have optima."""
+        """Add one effect; from several starts, as friction's smoothing and peak and a long delay have optima."""
         child = self.problem.added(parent, term, whole("rough_steps"))
         if term.candidate.kind.name == "deflection_delay":
             late = (PRIORS["late_deflection"].std * 2.0**k for k in (-1.0, 0.0, 1.0, 1.75))
@@ -227,6 +227,8 @@ class Search:
         sharpest = next(e.values[0] for e in self._library if e.candidate == term.candidate)
         softer = {**term.values, _SMOOTHING: choice("softer") * term.values[_SMOOTHING]}
         starts = [softer] if term.values == sharpest else [softer, dict(sharpest)]
+        if _PEAK in term.values:
+            starts.append({**softer, _PEAK: term.values[_PEAK] / choice("softer")})
         others = [self.problem.added(parent, Term(term.candidate, v), whole("rough_steps")) for v in starts]
         return max(child, *others, key=lambda h: h.evidence(child))
 

@@ -163,6 +163,13 @@ def test_the_object_of_a_block_download_is_disputed_until_it_is_read_again():
     assert (listener.disputed, listener.values) == (set(), {(0x1A00, 1): 0x60640020})
 
 
+@pytest.mark.parametrize("end", ["<80501f0122000106", ">80501f0100000405"])
+def test_a_block_download_that_is_refused_or_given_up_hides_no_other_write(end):
+    """The node that refuses firmware is mapped anew at once: those writes are no segments."""
+    listener = heard(">c2501f0100010000", end, ">2f001a0000000000", "<60001a0000000000")
+    assert listener.values == {(0x1A00, 0): 0}
+
+
 def after(configurator, *frames):
     for cob_id, data in frames:
         configurator.feed(cob_id, data, 0.0)

@@ -102,6 +102,8 @@ class SdoSniffer:
     def response(self, data: bytes, now_s: float) -> tuple[Address, bytes] | None:
         """Process a frame of the node, 0x580 + node; return the object of interest that it ends to read."""
         transfer, data = self._transfer, _padded(data)
+        if data and data[0] >> 5 == _ABORT:
+            self._block_s = -math.inf  # the node refuses a block download, or gives it up
         if not data or self._blocks:
             return None
         if transfer is None or now_s - transfer.asked_s > self._timeout_s or not _names(transfer, data):

@@ -8,6 +8,7 @@ import shutil
 import signal
 import threading
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,9 @@ from mcap.reader import make_reader
 from test_recording_recorder import joint_file
 
 from drivelink import cli, jointfile
+from drivelink._core import Assembler, JointPipeline
 from drivelink.cli import keep
+from drivelink.cycle.pipeline import build
 from drivelink.loop import blackbox
 from drivelink.loop.blackbox import AFTER_S, BlackBox
 from drivelink.loop.finding import drop_oldest, event_of, kept, taken, wish_of
@@ -91,6 +94,26 @@ def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(tmp_path, caplo
     assert read_attachment(path, SNAPSHOT) == b"garbage"
     assert len(list(open_playback(path, scene.box._text.joint, tmp_path))) == len(numbers)
     assert "the estimator begins anew: snapshot: expected one of version" in caplog.text
+
+
+def test_the_state_of_another_model_or_of_other_settings_is_not_used(tmp_path, caplog):
+    """A replay with a joint file is one of that file's model, whatever the recording began with."""
+    scene = Scene(tmp_path)
+    own = scene.box._text.joint
+    pipeline = JointPipeline(Assembler((), 0), *build(own))
+    for k in range(500):
+        pipeline.step(scene.sample(k))
+    scene.run(500)
+    scene.box.snapshot(pipeline.snapshot()[1])
+    scene.run(300, Status.MODEL_ALARM)
+    ((path, _),) = scene.finish()
+    heavier = own.motor[0].model_copy(update={"inertia_kg_m2": 2.0 * own.motor[0].inertia_kg_m2})
+    slower = replace(own.estimator, bandwidth_rad_s=10.0)
+    for changes, numbers in (({}, 122), ({"motor": (heavier,)}, 201), ({"estimator": slower}, 201)):
+        caplog.clear()
+        played = list(open_playback(path, own.model_copy(update=changes), tmp_path))
+        assert len(played) == numbers
+        assert ("another model or other settings" in caplog.text) == bool(changes)
 
 
 def test_a_state_that_is_read_before_the_first_model_is_of_it_and_not_of_the_next_one(tmp_path):

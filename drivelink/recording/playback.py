@@ -10,11 +10,13 @@ from typing import NamedTuple
 
 from drivelink._core import Assembler, JointPipeline, Tick
 from drivelink.cycle.pipeline import build
+from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile
 from drivelink.recording import read
 from drivelink.recording.canframes import FrameLog, is_frame_log
 from drivelink.recording.columns import ColumnMap
 from drivelink.recording.cycles import Cycle, estimated
+from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, recorded_cycles
 from estimator.sample import Sample
 
@@ -78,7 +80,7 @@ def open_playback(
         period_s, recorded = log.period_s, log.cycles()
     elif path.suffix.lower() == ".mcap":
         recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)
-        state = read_attachment(path, SNAPSHOT)
+        state = _state(path, joint)
     if recorded is not None:
         return Playback(
             joint,
@@ -102,12 +104,27 @@ def _from_samples(samples: Iterable[Sample], times: list[float], pipeline: Joint
         yield Played(time_s, step(sample, 0, round(time_s * 1e9)))
 
 
+def _state(path: Path, joint: JointFile) -> bytes | None:
+    """Return the state in which a recording's estimator begins; None: none of this joint file's model."""
+    state = read_attachment(path, SNAPSHOT)
+    if state is None:
+        return None
+    try:
+        own = joint_of(path, None).joint
+    except DrivelinkError:
+        own = None
+    if own is None or (own.model(), own.estimator) != (joint.model(), joint.estimator):
+        _LOG.warning("%s: the estimator begins anew: its state is of another model or other settings", path)
+        return None
+    return state
+
+
 def _after(
     state: bytes | None, cycles: Iterable[Cycle], pipeline: JointPipeline, path: Path
 ) -> Iterable[Cycle]:
     """Return the cycles after a recorded state, which the pipeline takes; all of them where there is none.
 
-    A state of another version of drivelink, or of another model than the pipeline's, is not used.
+    A state of another version of drivelink is not used.
     """
     if state is None:
         return cycles

@@ -10,6 +10,9 @@ import literals
 import pytest
 
 ROOT = Path(__file__).parent.parent
+sys.path.append(str(ROOT / "benchmarks"))
+from protections import PROTECTIONS  # noqa: E402
+
 STANDARD = set(sys.stdlib_module_names) | {"__future__"}
 ALLOWED = {
     "estimator": STANDARD | {"numpy", "scipy", "estimator"},
@@ -147,3 +150,9 @@ def test_no_circle_between_modules_in_rust(crate):
     needs = _rust_needs(ROOT / crate / "core" / "src")
     assert "lib" in needs
     assert _circles(needs) == set()
+
+
+@pytest.mark.parametrize("protection", PROTECTIONS, ids=lambda one: one.name)
+def test_every_protection_is_where_the_benchmark_takes_it_away(protection):
+    text = (ROOT / "drivelink" / protection.file).read_text(encoding="utf-8")
+    assert text.count(protection.before) == 1

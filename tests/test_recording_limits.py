@@ -439,6 +439,32 @@ def test_a_file_with_too_many_frames_is_refused_where_it_has_them(tmp_path):
         read(path, JOINT)
 
 
+def test_topics_without_end_take_no_memory(tmp_path):
+    """One of 15 MiB with a character that takes four bytes in memory, and so do all others then."""
+    path = mcap_of(tmp_path / "r.mcap", [("\U0001f600" + "a" * (15 << 20) + "/can", 0, b"{}")])
+    assert path.stat().st_size < 40_000
+    with little_memory(60):
+        assert list(read_messages(path)) == []
+
+
+def test_a_megabyte_changes_mappings_less_often_than_it_has_frames(tmp_path):
+    write, done = "2F001A00{:02d}000000", '{"id": 1409, "data": "60001A0000000000"}'
+    frames = []
+    for k in range(6000):
+        frames += [json.dumps({"id": 0x601, "data": write.format(k % 2)}), done]
+    path = mcap_of(tmp_path / "r.mcap", [("can", k * 100_000, f.encode()) for k, f in enumerate(frames)])
+    with one_line("changes of what its nodes send"):
+        read(path, JOINT)
+
+
+def test_syncs_further_apart_than_any_cycle_are_one_line(tmp_path):
+    path = tmp_path / "r.log"
+    path.write_text("".join(f"({k * 1_000_000}.0) c 080#\n" for k in range(1, 100)))
+    for work in (lambda: read(path, JOINT), lambda: open_playback(path, JOINT, tmp_path)):
+        with one_line("SYNCs, period_s: expected 1e-06 to 100 s"):
+            work()
+
+
 @pytest.mark.parametrize("topic", ["sample", "estimate"])
 def test_a_megabyte_has_fewer_samples_and_estimates_than_frames(topic, tmp_path):
     """Each costs as much as two frames; of a joint at rest they have 8 bytes at least, compressed as can be."""

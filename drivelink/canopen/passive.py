@@ -292,6 +292,7 @@ class PassiveConfigurator:
         self.missing: dict[int, DriveError] = {}  # for the others, what is missing
         # of the nodes in `layouts`, those whose layout is not trusted now: reason and remedy
         self.doubts: dict[int, str] = {}
+        self.judged = 0  # layouts that were made of what was heard
         self.poll(0.0)
 
     @property
@@ -369,6 +370,7 @@ class PassiveConfigurator:
             if node.seen_changes == node.listener.changes:
                 continue
             node.seen_changes = node.listener.changes
+            self.judged += 1
             try:
                 layout, doubt = node.layout()
                 doubt = node.dispute() or doubt

@@ -30,8 +30,11 @@ from drivelink.recording.cycles import (
     seconds,
 )
 from drivelink.recording.grid import report_gaps
+from drivelink.recording.limits import most_records
 from drivelink.recording.mapping import recorded_layouts, side_file
 from drivelink.recording.mcapfile import read_messages
+from estimator.errors import EstimatorError
+from estimator.ranges import require_in_range
 from estimator.sample import Record
 
 _LOG = logging.getLogger("drivelink.recording")
@@ -39,6 +42,8 @@ _LOG = logging.getLogger("drivelink.recording")
 _QUIET_SYNCS = 500  # without a change, the configuration has ended
 _MOST_HELD = 1 << 18  # frames among them: more than a bus of 127 nodes sends
 _WITHOUT_SYNC = 100_000  # frames at the beginning: half a minute of a bus whose master does not run yet
+_FEW_MAPPINGS = 5000  # changes of what a node sends that any file may have: to configure one makes dozens
+_RECORDS_OF_A_MAPPING = 64  # of the file, for each further one: it costs as much as dozens of them
 _PEEK = 20_000  # messages that show whether an MCAP file has samples
 
 
@@ -74,6 +79,8 @@ class FrameLog:
 
     def __init__(self, path: Path, joint: JointFile, base_dir: Path, channel: str | None = None) -> None:
         self._path = path
+        size = path.stat().st_size if path.is_file() else 0
+        self._most_judged = _FEW_MAPPINGS + most_records(size) // _RECORDS_OF_A_MAPPING
 
         def frames() -> Iterator[LoggedFrame]:
             mcap = path.suffix.lower() == ".mcap"
@@ -116,12 +123,19 @@ class FrameLog:
             for cycle in assembly.cycles(frames, jump):
                 samples = samples or cycle.sample is not None
                 yield cycle
+            self._require_few_mappings()
         doubts = list(assembly.follower.doubts.values())
         if not samples:
             why = f": {doubts[0]}" if doubts else self._absent(heard)
             raise RecordingError(f"{self._path}: no complete sample in it{why}")
         for doubt in doubts:
             _LOG.warning("%s: at its end, %s", self._path, doubt)
+
+    def _require_few_mappings(self) -> None:
+        if self._listener.judged > self._most_judged:
+            raise RecordingError(
+                f"{self._path}: expected at most {self._most_judged} changes of what its nodes send, got more"
+            )
 
     def _absent(self, heard: set[int]) -> str:
         """Frames of the mapping that are missing."""
@@ -163,7 +177,9 @@ class FrameLog:
             elif can_id in (OF_MAPS if self._passive else OF_SDO) and (listener.busy or not self._passive):
                 now_s = seconds(stamp_ns, len(syncs), listener.bus.period_s)
                 listener.feed(can_id, data, now_s)
-                if listener.poll(now_s):
+                changed = listener.poll(now_s)
+                self._require_few_mappings()
+                if changed:
                     head.clear()
                     quiet, heard, before = 0, True, before or (not heard and bool(syncs))
         return list(syncs), heard and not listener.busy, before
@@ -189,6 +205,10 @@ class FrameLog:
         measured = measure_period([stamp for stamp in syncs if stamp != NO_STAMP], configured_s)
         if measured is None or measured.same:
             return configured_s
+        try:
+            require_in_range("period_s", measured.period_s, positive=True)
+        except EstimatorError as error:
+            raise RecordingError(f"{self._path}: of its SYNCs, {error}") from error
         _LOG.warning(
             "%s: SYNC comes every %.4g s, not every %.4g s as bus.period_s says: taken as it comes",
             self._path,

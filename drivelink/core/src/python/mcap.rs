@@ -9,6 +9,8 @@ use pyo3::types::{PyBytes, PyString, PyTuple};
 use crate::json::{self, Value};
 use crate::mcap::{self, Record};
 
+const TOPIC: usize = 256; // bytes; a longer one is nobody's: ours have a joint's name, and the file 65 536 channels
+
 /// One message: topic, time, data.
 #[pyclass(frozen, get_all, module = "drivelink._core")]
 pub(super) struct McapMessage {
@@ -62,9 +64,10 @@ impl McapMessages {
             self.count += 1;
             match record {
                 Record::Channel(number, topic) => {
-                    let topic = String::from_utf8_lossy(topic);
+                    let wanted = topic.len() <= TOPIC;
+                    let topic = String::from_utf8_lossy(if wanted { topic } else { b"" });
                     let last = topic.rsplit('/').next().unwrap_or_default();
-                    if self.topics.as_ref().is_none_or(|topics| topics.contains(last)) {
+                    if wanted && self.topics.as_ref().is_none_or(|topics| topics.contains(last)) {
                         // Of a joint at rest, samples and estimates have twice the bytes of a frame.
                         let counts = 1 + u64::from(matches!(last, "sample" | "estimate"));
                         self.channels.insert(number, (PyString::new(py, &topic).unbind(), counts));

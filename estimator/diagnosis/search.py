@@ -216,7 +216,7 @@ class Search:
         return None
 
     def _grown(self, parent: Fitted, term: Term) -> Fitted:
-        """Add one effect; from several starts, as friction's smoothing and peak and a long delay have optima."""
+        """Add one effect; from several starts, as friction and a long delay have several optima."""
         child = self.problem.added(parent, term, whole("rough_steps"))
         if term.candidate.kind.name == "deflection_delay":
             late = (PRIORS["late_deflection"].std * 2.0**k for k in (-1.0, 0.0, 1.0, 1.75))

@@ -46,6 +46,8 @@ pub const CORNER: usize = 31;
 pub const SINE: std::ops::Range<usize> = 32..34;
 /// −bₖ′ cos q, likewise.
 pub const COSINE: std::ops::Range<usize> = 34..36;
+/// The torque's second derivative, N·m/s²: one that is read late by much.
+pub const TORQUE_SECOND: usize = 36;
 
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
@@ -68,8 +70,6 @@ pub struct Size {
 pub struct Balance {
     /// What the columns are scaled by; zero before there was motion.
     pub size: Size,
-    /// By how much the torque is read late, s: it is brought up by its derivatives.
-    pub late: f64,
     family: Family,
     position: Channel,
     torque: Channel,
@@ -91,7 +91,6 @@ impl Balance {
     pub fn new(family: Family) -> Balance {
         Balance {
             size: Size::default(),
-            late: 0.0,
             family,
             position: Channel::rest(0.0),
             torque: Channel::rest(0.0),
@@ -287,8 +286,8 @@ impl Balance {
     #[must_use]
     pub fn row(&self, link: &Channel) -> Row {
         let mut row: Row = [0.0; COLUMNS];
-        let [torque, rate] = self.torque();
-        (row[TORQUE], row[TORQUE_RATE]) = (torque - self.effects.main[0], rate);
+        let [torque, rate, second, _] = self.torque.main;
+        (row[TORQUE], row[TORQUE_RATE], row[TORQUE_SECOND]) = (torque - self.effects.main[0], rate, second);
         row[ACCELERATION] = self.position.main[2];
         row[VELOCITY] = self.position.main[1];
         row[OFFSET] = 1.0;
@@ -350,12 +349,10 @@ impl Balance {
         self.position.main[1]
     }
 
-    /// Filtered τ and its rate, where they act.
+    /// Filtered τ and its derivatives.
     #[must_use]
-    pub fn torque(&self) -> [f64; 2] {
-        let [value, first, second, third] = self.torque.main;
-        let s = self.late;
-        [value + s * (first + s / 2.0 * (second + s / 3.0 * third)), first + s * (second + s / 2.0 * third)]
+    pub fn torque(&self) -> &[f64; 4] {
+        &self.torque.main
     }
 
     /// Filtered θ and the filtered declared effects, with their derivatives.

@@ -15,13 +15,13 @@ use cholesky::Cholesky;
 pub use frame::{Frame, Reduced};
 
 /// Columns of a row.
-pub const COLUMNS: usize = 36;
+pub const COLUMNS: usize = 37;
 
 /// One value a column.
 pub type Row = [f64; COLUMNS];
 
 /// Unknowns of a balance, with index 0 for what they explain.
-pub const UNKNOWNS: usize = 29;
+pub const UNKNOWNS: usize = 30;
 
 /// One value an unknown.
 pub type Vector = [f64; UNKNOWNS];

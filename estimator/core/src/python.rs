@@ -168,6 +168,7 @@ fn priors(py: Python<'_>) -> PyResult<Priors> {
         torque_offset: std("torque_offset")?,
         deflection_offset: std("declared_zero")?,
         encoder_delay: std("encoder_delay")?,
+        late: std("late")?,
         load_dependent_friction: std("load_dependent_friction")?,
         encoder_eccentricity: std("encoder_eccentricity")?,
         undeclared: std("undeclared_effect")?,

@@ -101,6 +101,8 @@ pub struct Priors {
     pub deflection_offset: f64,
     /// Of the link encoder's delay, periods.
     pub encoder_delay: f64,
+    /// Of a motor torque's delay or lag, s.
+    pub late: f64,
     /// Of the share of the torque that a gear loses.
     pub load_dependent_friction: f64,
     /// Of what the link encoder reads wrong once a revolution, rad.
@@ -124,6 +126,7 @@ impl Priors {
         torque_offset: 0.3,
         deflection_offset: 0.003,
         encoder_delay: 1.0,
+        late: 0.005,
         load_dependent_friction: 0.25,
         encoder_eccentricity: 0.01,
         undeclared: 0.05,

@@ -36,8 +36,6 @@ pub struct Moment<'a> {
 pub enum Shift {
     /// The link is so many periods late.
     Late(f64),
-    /// The torque is so many periods later than was assumed.
-    TorqueLate(f64),
     /// The zero is at this deflection, rad.
     Zero(f64),
     /// The zero is not where it was.
@@ -240,7 +238,7 @@ impl Side {
         self.followed_s -= self.period;
         self.held_s += self.period;
         if !self.rigid {
-            let late_s = self.balance.late + self.blocks.torque_lateness().0;
+            let late_s = self.blocks.torque_lateness().0;
             let late = last.torque[i] + late_s * self.balance.light_torque()[1];
             self.deflection.update(theta, phi, late + self.acting - self.effect);
             self.balance.observe(phi, usable && can_be);
@@ -340,29 +338,16 @@ impl Side {
         if self.doubtful || self.blocks.is_lost() {
             return None; // a zero that is elsewhere looks late
         }
-        let beyond = |(late, std): (f64, f64), least: f64| late.abs() - least * self.period > SURE * std;
-        let link = self.blocks.delay().filter(|late| beyond(*late, 0.5));
-        let torque = Some(self.blocks.torque_lateness()).filter(|late| beyond(*late, 1.0));
-        let periods = |(late, _): (f64, f64)| late / self.period;
-        // What is left of a torque's lateness is not below 0.
-        link.map(|late| Shift::Late(periods(late).round()))
-            .or_else(|| torque.map(|late| Shift::TorqueLate(periods(late).floor())))
+        let (late, std) = self.blocks.delay()?;
+        let beyond = late.abs() - 0.5 * self.period > SURE * std;
+        beyond.then(|| Shift::Late((late / self.period).round()))
     }
 
     /// Names of the effects that nobody declared. A drive that samples or averages its torque is a period late.
     pub fn undeclared(&self) -> impl Iterator<Item = &'static str> {
         let (late, std) = self.blocks.torque_lateness();
-        let late = (self.balance.late + late).abs() - self.period > SURE * std;
+        let late = late - self.period > SURE * std;
         self.blocks.undeclared().chain(late.then_some("torque_delay"))
-    }
-
-    /// The torque is read so many periods later than was assumed, if a filter of this bandwidth can bring it up.
-    pub fn shift_torque(&mut self, periods: f64, bandwidth_rad_s: f64, theta: f64, phi: f64) {
-        let late = self.balance.late + periods * self.period;
-        if late.abs() * bandwidth_rad_s < 1.0 {
-            self.balance.late = late;
-            self.relearn(theta, phi);
-        }
     }
 
     /// What the blocks say of themselves, at their ends.

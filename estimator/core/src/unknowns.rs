@@ -31,24 +31,26 @@ pub const SPRING: std::ops::Range<usize> = 5..5 + TERMS;
 pub const ZERO: usize = 10;
 /// By how much the link position is later than was assumed, s.
 pub const LATE: usize = 11;
-/// By how much the torque is later than was assumed, s.
+/// By how much the torque is late, s.
 pub const TORQUE_LATE: usize = 12;
+/// Of its second derivative, s²: half the square of a delay, zero of a lag.
+pub const TORQUE_BEND: usize = 13;
 /// Friction that grows with speed before it is full, N·m.
-pub const SOFT: usize = 13;
+pub const SOFT: usize = 14;
 /// Friction that grows with the load, N·m at the largest deflection.
-pub const LOAD: std::ops::Range<usize> = 14..16;
+pub const LOAD: std::ops::Range<usize> = 15..17;
 /// Damping of the transmission, N·m·s/rad.
-pub const RATE: usize = 16;
+pub const RATE: usize = 17;
 /// Memory of the transmission, N·m at half the range.
-pub const STOPS: std::ops::Range<usize> = 17..20;
+pub const STOPS: std::ops::Range<usize> = 18..21;
 /// A spring of any shape, N·m at half the range.
-pub const CLIPS: std::ops::Range<usize> = 20..24;
+pub const CLIPS: std::ops::Range<usize> = 21..25;
 /// A corner of the stiffness at zero, N·m at the largest deflection.
-pub const CORNER: std::ops::Range<usize> = 24..25;
+pub const CORNER: std::ops::Range<usize> = 25..26;
 /// A spring that is stiffer to one side: of |φ|, N·m at the largest deflection, and of φ², N·m/rad².
-pub const ASYMMETRY: std::ops::Range<usize> = 25..27;
+pub const ASYMMETRY: std::ops::Range<usize> = 26..28;
 /// What the link encoder reads too little, by sin q and cos q, rad.
-pub const ECCENTRIC: std::ops::Range<usize> = 27..29;
+pub const ECCENTRIC: std::ops::Range<usize> = 28..30;
 
 /// Those that every joint has.
 pub const ACTIVE: Set = (1 << TORQUE_LATE) - 2;
@@ -317,6 +319,7 @@ impl Spring {
             self.law.jacobian(phi + self.zero, alpha, &mut row[..self.size]);
         }
         frame.directions[TORQUE_LATE][balance::TORQUE_RATE] = -1.0;
+        frame.directions[TORQUE_BEND][balance::TORQUE_SECOND] = -1.0;
         for (i, unknown) in SPRING.enumerate().take(self.size) {
             let column: [f64; NODES] = std::array::from_fn(|k| rows[k][i]);
             place(&mut frame.directions[unknown], &projection.fit(&column), 1.0);

@@ -99,11 +99,6 @@ impl Robust {
         for (i, shift) in shifts.iter().enumerate() {
             match *shift {
                 Some(Shift::Late(periods)) => late = Some(periods),
-                Some(Shift::TorqueLate(periods)) => {
-                    let at = &self.live.last.at;
-                    let (theta, phi) = (at.motor[i], at.deflection(i));
-                    self.sides[i].shift_torque(periods, self.filters.main.bandwidth, theta, phi);
-                }
                 Some(Shift::Zero(off)) => self.recentre(i, off),
                 Some(Shift::Lost) => lost[i] = true,
                 None => {}

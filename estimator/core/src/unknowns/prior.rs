@@ -1,8 +1,8 @@
 //! What is believed of the unknowns before any data.
 
 use super::{
-    CORNER, DAMPING, DRY, ECCENTRIC, INERTIA, LATE, LOAD, OFFSET, SOFT, SPRING, Scale, Spring, TORQUE_LATE,
-    USUAL, ZERO,
+    CORNER, DAMPING, DRY, ECCENTRIC, INERTIA, LATE, LOAD, OFFSET, SOFT, SPRING, Scale, Spring, TORQUE_BEND,
+    TORQUE_LATE, USUAL, ZERO,
 };
 use crate::balance;
 use crate::gram::{Frame, Gram, Prior, UNKNOWNS, inverse, set};
@@ -61,7 +61,8 @@ impl Spring {
         }
         (mean[ZERO], std[ZERO]) = (-self.zero, zero_std);
         std[LATE] = priors.encoder_delay * period_s;
-        std[TORQUE_LATE] = 0.5 * period_s; // held, sampled, or averaged over a period
+        std[TORQUE_LATE] = priors.late.hypot(0.5 * period_s); // filtered; held, sampled, or averaged over a period
+        std[TORQUE_BEND] = 0.5 * std[TORQUE_LATE].powi(2);
         self.with_declared(Prior::independent(mean, &std))
     }
 

@@ -110,6 +110,7 @@ fn priors() -> Priors {
         torque_offset: 0.02,
         deflection_offset: 0.05,
         encoder_delay: 1.0,
+        late: 0.005,
         load_dependent_friction: 0.25,
         encoder_eccentricity: 0.01,
         undeclared: 0.05,

@@ -102,7 +102,7 @@ pub struct Blocks {
     /// The least and the largest deflection since they are counted from where they are, rad.
     pub seen: [f64; 2],
     family: Family,
-    located: bool, // a lost zero, so well that the balance can be linearised
+    located: bool, // a zero elsewhere, so well that the balance can be linearised
     /// How far a lost zero is from where deflections are counted from, rad; 0: near.
     pub off: f64,
     /// Whether evidence chose a zero that is not the declared one.
@@ -243,7 +243,8 @@ impl Blocks {
     #[must_use]
     pub fn is_unconfirmed(&self) -> bool {
         let nothing_before = self.carried.is_none() && !self.spring.is_anchored();
-        self.ring.len() < FEWEST && (nothing_before || self.lost && !self.spring.is_constant())
+        self.moved && !self.located
+            || self.ring.len() < FEWEST && (nothing_before || self.lost && !self.spring.is_constant())
     }
 
     /// Whether nothing has been learned, and no zero has been lost.

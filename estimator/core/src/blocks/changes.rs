@@ -1,5 +1,6 @@
 //! Blocks that what is known does not explain: has the joint changed, or a reading, or the zero?
 
+use super::solve::ZEROS;
 use super::{Blocks, Carried, Closed};
 use crate::balance;
 use crate::causes::{Cause, Known, Noise, Odds, TABLE};
@@ -187,5 +188,14 @@ impl Blocks {
     pub fn recentre(&mut self) {
         self.lose_zero();
         self.located = true;
+    }
+
+    /// Evidence has said where the zero is. One that is not the declared one is known when two blocks say so, and the
+    /// balance is linearised near it: a step of the iteration stays within a part of the motion.
+    pub(super) fn place_zero(&mut self, moved: bool, step: f64) {
+        if moved {
+            self.located = self.moved && f64::from(ZEROS) * step <= self.seen[1] - self.seen[0];
+        }
+        self.moved = moved;
     }
 }

@@ -4,7 +4,9 @@ use super::Blocks;
 use crate::balance::Balance;
 use crate::choices::{BLOCKS, UNUSUAL, USEFUL};
 use crate::gram::{UNKNOWNS, set};
-use crate::unknowns::{CANDIDATES, LATE, OFFSET, RATE, Reading, SOFT, TORQUE_LATE, ZERO};
+use crate::unknowns::{
+    ASYMMETRY, CANDIDATES, CLIPS, CORNER, LATE, OFFSET, RATE, Reading, SOFT, STOPS, TORQUE_LATE, ZERO,
+};
 
 impl Blocks {
     /// Delay of the link position, s, and its standard deviation.
@@ -62,6 +64,19 @@ impl Blocks {
     #[must_use]
     pub fn zero_std(&self) -> f64 {
         self.posterior.as_ref().map_or(0.0, |known| known.covariance[ZERO][ZERO].sqrt())
+    }
+
+    /// The constant torque that is the zero's or the reading's where nothing tells which, N·m: by a straight line, or beside
+    /// effects that bend the curve as another zero would; 0: a lost zero, or a curve that is the declared one.
+    #[must_use]
+    pub fn zero_torque(&self, stiffness: f64) -> f64 {
+        let Some(known) = self.posterior.as_ref().filter(|_| !self.lost) else { return 0.0 };
+        let bending = set(STOPS) | set(CLIPS) | set(CORNER) | set(ASYMMETRY);
+        let straight = self.spring.is_constant() && !self.moved;
+        if !straight && known.set & bending == 0 && !self.spring.is_longer(known.set) {
+            return 0.0;
+        }
+        known.x[OFFSET].abs().max(if self.moved { (stiffness * self.spring.zero).abs() } else { 0.0 })
     }
 
     /// rms of what is left of the balance, over that of the measured torque without its mean; NaN before any.

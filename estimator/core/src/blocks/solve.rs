@@ -14,7 +14,7 @@ use crate::unknowns::{
     ZERO,
 };
 
-const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
+pub(super) const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
 const WIDE: f64 = 1e6; // of a prior that says nothing
 const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
 
@@ -189,7 +189,6 @@ impl Blocks {
                 return;
             };
             let used = if moved { self.prior(&total, &frame, self.deflection) } else { prior };
-            self.moved = moved;
             let own = total.quadratic(&frame.residual(&chosen.x, chosen.set)) / total.rows;
             self.own = own.sqrt().max(EXACT * total.rms(balance::TORQUE));
             let usual = self.motor.fit_rms.map_or(0.0, |(_, torque)| torque); // little motion is no worse model
@@ -203,6 +202,7 @@ impl Blocks {
             if step + 1 < STEPS && far && !self.spring.is_settled() {
                 continue;
             }
+            self.place_zero(moved, before[ZERO].abs());
             self.friction = frame.rms(&total, &chosen, shaped());
             let omitted = self.omitted(&frame, &reduced, &total, &chosen, &used, noise);
             let attenuated = self.attenuated(&chosen, total.rows, noise);

@@ -65,10 +65,11 @@ impl Side {
         let lost = self.blocks.is_lost();
         let least = valid_within * self.blocks.torque_rms();
         let imprecise = part.flexibility_torque_std >= least || part.flexibility_torque_std.is_nan();
-        let elsewhere = lost || part.stiffness * self.blocks.zero_std() >= least;
+        let guessed = self.blocks.zero_torque(part.stiffness) >= least;
+        let elsewhere = lost || guessed || part.stiffness * self.blocks.zero_std() >= least;
         let share = part.flexibility_torque_std / self.blocks.torque_rms();
         let why = if elsewhere { Reason::Lost } else { Reason::TorqueImprecise(share) };
-        let torque = imprecise.then_some(why);
+        let torque = (imprecise || guessed).then_some(why);
         let stiffness = Reason::of_precision(part.stiffness, part.stiffness_std, valid_within)
             .map(|reason| if lost { Reason::Lost } else { reason });
         [stiffness.or(torque), torque]
@@ -86,7 +87,7 @@ impl Side {
         if nothing || self.blocks.is_unconfirmed() {
             return Some(match self.renewed {
                 _ if !settled => Reason::Settling,
-                _ if self.blocks.is_lost() => Reason::Lost,
+                _ if self.blocks.is_lost() || self.blocks.moved => Reason::Lost,
                 true => Reason::Lever,
                 false => Reason::Unmoved,
             });

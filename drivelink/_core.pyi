@@ -1,8 +1,9 @@
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.pipeline import ResidualMonitor
+from drivelink.recording.canlog import LoggedFrame
 from estimator.online import Estimator
 from estimator.sample import Estimate, External, Sample
 
@@ -226,6 +227,27 @@ class McapMessages:
 
     def __iter__(self) -> McapMessages: ...
     def __next__(self) -> McapMessage: ...
+
+class SyncNumbering:
+    """Numbers the SYNCs of a stream once enough others have followed.
+
+    Args:
+        measure: called with the stamps of the first SYNCs and the period; returns the period to be used.
+
+    Attributes:
+        period_s: in use.
+    """
+
+    def __init__(
+        self, period_s: float, measure: Callable[[Sequence[int], float], float] | None = None
+    ) -> None: ...
+    @property
+    def period_s(self) -> float: ...
+    def push(self, frame: LoggedFrame) -> tuple[Sequence[LoggedFrame], int] | None:
+        """Process a frame; return what is decided now, see `Numbered`."""
+
+    def pop(self) -> tuple[Sequence[LoggedFrame], int] | None:
+        """Return the first of what waits, after the end of the stream; None: nothing."""
 
 class LatencyHistogram:
     """A distribution of durations: counts per microsecond up to 5 ms, and the maximum.

@@ -3,6 +3,7 @@
 import logging
 import random
 import struct
+import time
 import zlib
 from io import BytesIO
 
@@ -12,7 +13,7 @@ import pytest
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.recording.canlog import CAN_FORMATS, NO_STAMP, LoggedFrame, read_frames
-from drivelink.recording.cycles import SyncNumbering, numbered_ahead, numbered_at_once
+from drivelink.recording.cycles import SyncNumbering, measured_period, numbered_ahead, numbered_at_once
 from drivelink.recording.formats import open_sink
 from drivelink.recording.limits import AscText
 
@@ -164,11 +165,9 @@ def test_gaps_are_what_is_lost_and_nothing_else(stamps_ms, expected):
 
 @pytest.mark.parametrize("factor", [1.04, 1.5, 3.0])
 def test_a_recorder_numbers_by_the_period_that_sync_has(factor):
-    numbering = SyncNumbering(1e-3, measure=True)
-    frames = syncs([k * factor for k in range(300)])
-    jumps = [jump for frame in frames for _, jump in numbering.push(frame)]
-    jumps += [jump for _, jump in numbering.rest()]
-    assert jumps == [1] * 300
+    numbering = SyncNumbering(1e-3, measured_period)
+    found = [*map(numbering.push, syncs([k * factor for k in range(300)])), *iter(numbering.pop, None)]
+    assert [one[1] for one in found if one is not None] == [1] * 300
 
 
 def test_only_lines_of_an_asc_file_that_say_something_are_looked_at(tmp_path):
@@ -176,6 +175,24 @@ def test_only_lines_of_an_asc_file_that_say_something_are_looked_at(tmp_path):
     text = AscText(BytesIO(foreign + head + foreign + b"0.1 event\n0.2 1 80 Rx d 0\n"), tmp_path / "r.asc")
     found = [text.readline() for _ in range(4)]
     assert found == [head.decode(), "0.100000000 event\n", "0.300000000 1 80 Rx d 0\n", ""]
+
+
+def test_a_channel_that_ends_like_a_frame_keeps_its_stamp(tmp_path):
+    path = tmp_path / "r.log"
+    path.write_bytes(b"(1.0) a# 080#\n (2.0)  a#  12  [1]  05\n")
+    frames = list(read_frames(path))
+    assert [tuple(one) for one in frames[:2]] == [(10**9, 0x80, b"", "a#"), (2 * 10**9, 0x12, b"\5", "a#")]
+
+
+def test_lines_of_other_tools_cost_no_more_than_frames(tmp_path):
+    costs = []
+    for lines in (b"c 80#\nc 80#\n", b"c 80#\nx\n"):
+        path = tmp_path / "r.log"
+        path.write_bytes(lines * 20_000)
+        begin = time.process_time()
+        assert len(list(read_frames(path))) >= 20_000
+        costs.append(time.process_time() - begin)
+    assert costs[1] < 1.1 * costs[0]
 
 
 def test_a_text_with_more_foreign_lines_than_frames_is_no_log(tmp_path):

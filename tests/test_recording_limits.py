@@ -18,14 +18,13 @@ import pytest
 import zstandard
 from fuzzparsers import JOINT, RECORDINGS, TEXT, frames, held, read_every_way, write_recording
 
-from drivelink._core import JsonNumbers
+from drivelink._core import JsonNumbers, SyncNumbering
 from drivelink.canopen.eds import load_eds
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import ZenohSection, load
 from drivelink.recording import canframes, read
 from drivelink.recording.canlog import CAN_FORMATS, LoggedFrame, in_order, read_frames
 from drivelink.recording.corrections import Gathered
-from drivelink.recording.cycles import SyncNumbering
 from drivelink.recording.formats import FORMATS, open_sink
 from drivelink.recording.mapping import joint_of, side_file
 from drivelink.recording.mcapfile import read_messages

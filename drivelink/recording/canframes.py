@@ -119,7 +119,8 @@ class FrameLog:
         numbered = numbered_at_once if self._follow else numbered_ahead
         for frames, jump in numbered(chain(self._head, self._frames), self.period_s):
             if not samples:
-                heard.update([frame[1] for frame in frames])
+                for frame in frames:
+                    heard.add(frame[1])
             for cycle in assembly.cycles(frames, jump):
                 samples = samples or cycle.sample is not None
                 yield cycle

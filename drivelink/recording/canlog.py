@@ -58,7 +58,7 @@ NO_STAMP = -1
 _EXTENDED_DIGITS = 8
 _LAST_ID = 0x7FF
 _LONGEST = 64  # bytes of a frame, excluding CAN XL
-_LINE = 16 << 10  # bytes; candump's longest, of CAN XL, has 6 KiB
+_LONGEST_LINE = 16 << 10  # bytes; candump's longest, of CAN XL, has 6 KiB
 _HOPELESS = 20  # more unknown lines than frames: it is not a log
 _FOREIGN = 20_000  # messages at the beginning without a frame of CANopen, likewise
 _DISORDER_NS = 1_000_000_000  # largest disorder of stamps within a file
@@ -79,14 +79,12 @@ logged: Callable[[Frame], LoggedFrame] = partial(tuple.__new__, LoggedFrame)  # 
 
 
 # (1436509052.249713) vcan0 044#2A366C2BBA R          candump -L; brackets or none
-_COMPACT = re.compile(
-    rb"^[ \t]*(?:\(?(\d{1,11})[.,](\d+)\)?[ \t]+)?(\S+)[ \t]+([0-9A-Fa-f]{1,8})#"
-    rb"(#[0-9A-Fa-f])?([0-9A-Fa-f.]*)(R?)"
-)
 #  (1436509052.249713)  vcan0  RX - -  044   [5]  2A 36 6C 2B BA   '*6l+.'
-_SPACED = re.compile(
-    rb"^[ \t]*(?:\(?(\d{1,11})[.,](\d+)\)?[ \t]+)?(\S+)[ \t]+(?:[RT]X(?:[ \t]+[-BE]){0,2}[ \t]+)?"
-    rb"([0-9A-Fa-f]{1,8})[ \t]+\[ ?0?(\d{1,4})\][ \t]*((?:[0-9A-Fa-f]{2}(?:[ \t]+|$))*)(.*)"
+_LINE = re.compile(
+    rb"^[ \t]*(?:\(?(\d{1,11})[.,](\d+)\)?[ \t]+)?(\S+)[ \t]+(?:"
+    rb"([0-9A-Fa-f]{1,8})#(?:#[0-9A-Fa-f])?([0-9A-Fa-f.]*)(R?)|"
+    rb"(?:[RT]X(?:[ \t]+[-BE]){0,2}[ \t]+)?"
+    rb"([0-9A-Fa-f]{1,8})[ \t]+\[ ?0?(\d{1,4})\][ \t]*((?:[0-9A-Fa-f]{2}(?:[ \t]+|$))*)(.*))"
 )
 #  (2026-01-31 09:41:02.249713)  …                     candump -t A
 _DATE = re.compile(rb"^[ \t]*\((\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)\.(\d+)\)")
@@ -123,9 +121,9 @@ def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]
         stamp_ns = frame[0] + offset
         if last <= stamp_ns <= LAST_STAMP_NS:
             last = stamp_ns
-            yield frame._replace(stamp_ns=stamp_ns) if offset else frame
+            yield logged((stamp_ns, *frame[1:])) if offset else frame
             continue
-        if last - stamp_ns > _DISORDER_NS and frame.stamp_ns != NO_STAMP:
+        if last - stamp_ns > _DISORDER_NS and frame[0] != NO_STAMP:
             jumps += 1
             if jumps == 1:
                 _LOG.warning(
@@ -139,7 +137,7 @@ def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]
             stamp_ns = last + _GAP_NS
         require_stamp(stamp_ns, path)
         last = max(last, stamp_ns)
-        yield frame._replace(stamp_ns=stamp_ns) if offset and frame.stamp_ns != NO_STAMP else frame
+        yield logged((stamp_ns, *frame[1:])) if offset and frame[0] != NO_STAMP else frame
     if jumps > 1:
         _LOG.warning("%s: the stamps jump back %d times more", path, jumps - 1)
 
@@ -175,19 +173,15 @@ def _text_frames(path: Path) -> Iterator[LoggedFrame]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-_Parser = Callable[[bytes], LoggedFrame | None]
-
-
 def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
     """The data frames with 11-bit identifiers, in both formats of candump; foreign lines are counted."""
-    parsers: list[_Parser] = [_compact, _spaced]  # first that of the line before
     understood = strange = 0  # lines that are frames, also omitted ones, and others
     first_strange = ""
     for number, line in enumerate(whole_lines(file, path), start=1):
         if line.isspace() or line.lstrip().startswith((b"#", b";")):
             continue
         try:
-            frame = _either(line, parsers)
+            frame = _frame(line)
         except ValueError:
             strange += 1
             first_strange = first_strange or f"line {number}: {line.strip()[:60].decode(errors='replace')!r}"
@@ -204,47 +198,29 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
         _LOG.warning(text, path, strange, first_strange)
 
 
-def _either(line: bytes, parsers: list[_Parser]) -> LoggedFrame | None:
-    """Return the frame; a parser that understands it where the first does not becomes the first."""
-    if len(line) > _LINE:
+def _frame(line: bytes) -> LoggedFrame | None:
+    """Return the frame of a line; None: it is none of CANopen's.
+
+    Raises:
+        ValueError: it is no frame.
+    """
+    if len(line) > _LONGEST_LINE or not (match := _LINE.match(line) or _LINE.match(_undated(line))):
         raise ValueError
-    try:
-        return parsers[0](line)
-    except ValueError:
-        parsers.reverse()
-        return parsers[0](line)
-
-
-def _compact(line: bytes) -> LoggedFrame | None:
-    match = _COMPACT.match(line) or _COMPACT.match(_undated(line))
-    if match is None:
-        raise ValueError
-    seconds, fraction, channel, can_id, _fd_flags, data, remote = match.groups()
-    return None if remote else _frame(seconds, fraction, channel, can_id, data.replace(b".", b""))
-
-
-def _spaced(line: bytes) -> LoggedFrame | None:
-    match = _SPACED.match(line) or _SPACED.match(_undated(line))
-    if match is None:
-        raise ValueError
-    seconds, fraction, channel, can_id, length, data, rest = match.groups()
-    if rest.startswith((b"remote", b"ERRORFRAME")) or int(length) > _LONGEST:
+    seconds, fraction, channel, can_id, data, remote, spaced_id, length, spaced, rest = match.groups()
+    least = 0
+    if length is not None:
+        least = int(length)
+        remote = least > _LONGEST or rest.startswith((b"remote", b"ERRORFRAME"))
+        # the characters that -a appends may look like bytes
+        can_id, data = spaced_id, b"".join(spaced.split()[:least])
+    if remote:
         return None
-    data = b"".join(data.split()[: int(length)])  # the characters that -a appends may look like bytes
-    frame = _frame(seconds, fraction, channel, can_id, data)
-    if frame is not None and len(frame.data) < int(length):
-        raise ValueError
-    return frame
-
-
-def _frame(
-    seconds: bytes | None, fraction: bytes, channel: bytes, can_id: bytes, data: bytes
-) -> LoggedFrame | None:
-    """Return a frame of its texts; None: it is none of CANopen's."""
-    payload = unhexlify(data)
-    if len(can_id) == _EXTENDED_DIGITS or int(can_id, 16) > _LAST_ID or len(payload) > _LONGEST:
+    payload, number = unhexlify(data.replace(b".", b"")), int(can_id, 16)
+    if len(can_id) == _EXTENDED_DIGITS or number > _LAST_ID or len(payload) > _LONGEST:
         return None
-    return LoggedFrame(_stamp(seconds, fraction), int(can_id, 16), payload, channel.decode(errors="replace"))
+    if len(payload) < least:
+        raise ValueError
+    return logged((_stamp(seconds, fraction), number, payload, channel.decode("utf-8", "replace")))
 
 
 def _stamp(seconds: bytes | None, fraction: bytes) -> int:
@@ -254,10 +230,10 @@ def _stamp(seconds: bytes | None, fraction: bytes) -> int:
 
 
 def _undated(line: bytes) -> bytes:
-    """Replace date and time at the beginning of a line by seconds."""
+    """Replace date and time at the beginning of a line by seconds; empty: it has none."""
     match = _DATE.match(line)
     if match is None:
-        raise ValueError
+        return b""
     # As UTC: only differences matter, without daylight saving time.
     moment = datetime.fromisoformat(match[1].decode() + "+00:00")
     return b"(%d.%s)" % (int(moment.timestamp()), match[2]) + line[match.end() :]
@@ -281,8 +257,8 @@ def _dated(first: list[LoggedFrame], frames: Iterable[LoggedFrame], path: Path) 
 def _added_up(frames: Iterable[LoggedFrame]) -> Iterator[LoggedFrame]:
     total = 0
     for frame in frames:
-        total += frame.stamp_ns
-        yield frame._replace(stamp_ns=total)
+        total += frame[0]
+        yield logged((total, *frame[1:]))
 
 
 def _asc_frames(file: IO[bytes], path: Path) -> Iterator[Frame | None]:

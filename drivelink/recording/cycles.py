@@ -1,16 +1,14 @@
 """Recorded cycles as input of the pipeline; those of raw frames are numbered by later SYNCs.
 
-Recorded stamps are often arrival times, which come in bursts. After a late SYNC others catch up; after a lost
-one all stay behind. `SyncClock` has to decide at once and cannot distinguish them.
+`SyncClock` has to decide at once, and cannot distinguish late SYNCs from what follows a lost one.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from drivelink._core import SYNC_COB_ID, JointPipeline, Tick
+from drivelink._core import SYNC_COB_ID, JointPipeline, SyncNumbering, Tick
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.following import follow_log
 from drivelink.cycle.objectcheck import RecentSamples
@@ -44,11 +42,6 @@ def estimated(cycles: Iterable[Cycle], pipeline: JointPipeline) -> Iterator[Tick
             yield tick
 
 
-_AHEAD = 64  # later SYNCs used to number one
-_EXTRA = -0.5  # periods too early: a SYNC of another master
-_FOLLOW = 0.05  # of the deviation, per SYNC: the two clocks drift
-
-
 Numbered = tuple[Sequence[LoggedFrame], int]
 """Frames, and the jump of the SYNC that may be the first: periods since the one before, 0 if not due."""
 
@@ -66,91 +59,14 @@ def numbered_at_once(frames: Iterable[LoggedFrame], period_s: float) -> Iterator
 def numbered_ahead(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[Numbered]:
     """Each SYNC, numbered by later ones, with the frames until the next one."""
     numbering = SyncNumbering(period_s)
-    for frame in frames:
-        if found := numbering.push(frame):
-            yield from found
-    yield from numbering.rest()
+    yield from filter(None, map(numbering.push, frames))
+    yield from iter(numbering.pop, None)
 
 
-class SyncNumbering:
-    """Numbers the SYNCs of a stream once enough others have followed.
-
-    Args:
-        measure: use the period of the first SYNCs if it differs.
-    """
-
-    def __init__(self, period_s: float, *, measure: bool = False) -> None:
-        self._measure = measure
-        self._last: int | None = None
-        self._due_ns: float | None = None
-        self._cycles: deque[list[LoggedFrame]] = deque()  # each waiting SYNC and its frames
-        self._stamps: deque[int] = deque()  # of these SYNCs
-        self._number = 0  # of the first of them
-        self._earliest: deque[tuple[int, int, int]] = deque()  # see `_await`
-        self._begin(period_s)
-
-    def push(self, frame: LoggedFrame) -> Sequence[Numbered]:
-        """Process a frame; return what is decided now."""
-        cycles = self._cycles
-        if frame[1] != SYNC_COB_ID:
-            if not cycles:
-                return (((frame,), 1),)
-            cycles[-1].append(frame)
-            return ()
-        cycles.append([frame])
-        self._await(frame[0])
-        return ((cycles.popleft(), self._jump()),) if len(cycles) > _AHEAD else ()
-
-    def rest(self) -> Sequence[Numbered]:
-        """End the stream; return all that waits."""
-        return [(self._cycles.popleft(), self._jump()) for _ in range(len(self._cycles))]
-
-    def _begin(self, period_s: float, stamps: Iterable[int] = ()) -> None:
-        """Set the period in use; the SYNCs that wait begin anew with it."""
-        self.period_s, self._step_ns = period_s, round(period_s * 1e9)
-        self._stamps.clear()
-        self._earliest.clear()
-        for stamp in stamps:
-            self._await(stamp)
-
-    def _await(self, stamp: int) -> None:
-        """Add a SYNC; keep lateness, number and stamp of those that no later one is less late than."""
-        number, earliest = self._number + len(self._stamps), self._earliest
-        late = stamp - number * self._step_ns
-        while earliest and earliest[-1][0] > late:
-            earliest.pop()
-        earliest.append((late, number, stamp))
-        self._stamps.append(stamp)
-
-    def _jump(self) -> int:
-        """Return the jump of the first waiting SYNC."""
-        stamps = self._stamps
-        if self._measure:
-            self._measure = False
-            measured = measure_period(list(stamps), self.period_s) if NO_STAMP not in stamps else None
-            self._begin(self.period_s if measured is None else measured.period_s, tuple(stamps))
-        period_ns = self.period_s * 1e9
-        stamp = stamps.popleft()
-        _, number, first = self._earliest[0]
-        ahead = number - self._number  # SYNCs until that one
-        if not ahead:
-            self._earliest.popleft()
-        self._number += 1
-        if stamp == NO_STAMP:
-            return 1
-        due, last, self._last = self._due_ns, self._last, stamp
-        if due is None or (last is not None and stamp < last - period_ns):  # the clock was set back
-            self._due_ns = first - ahead * period_ns + period_ns
-            return 1
-        late = (stamp - due) / period_ns
-        if late < _EXTRA:
-            return 0
-        lost = 0
-        if late > 0.5:
-            lost = max(0, round((first - due) / period_ns - ahead))
-        left = late - lost
-        self._due_ns = due + (1 + lost + (_FOLLOW * left if abs(left) < 0.5 else 0.0)) * period_ns
-        return 1 + lost
+def measured_period(stamps_ns: Sequence[int], period_s: float) -> float:
+    """Return the period of SYNCs from their stamps, or the expected one."""
+    measured = None if NO_STAMP in stamps_ns else measure_period(stamps_ns, period_s)
+    return period_s if measured is None else measured.period_s
 
 
 def seconds(stamp_ns: int, sync: int, period_s: float) -> float:
@@ -208,7 +124,7 @@ class FrameSamples:
 
     def __init__(self, joint: JointFile, listener: PassiveConfigurator) -> None:
         self._joint, self._listener = joint, listener
-        self._numbering = SyncNumbering(joint.bus.period_s, measure=True)
+        self._numbering = SyncNumbering(joint.bus.period_s, measured_period)
         self._assembly: Assembly | None = None
         self._lacking = ""  # missing parts of a known mapping
 
@@ -230,11 +146,12 @@ class FrameSamples:
 
     def feed(self, frame: LoggedFrame) -> list[tuple[Sample, int]]:
         """Process a frame; return the samples that are certain now, and the stamps of their SYNCs."""
-        return self._made(self._numbering.push(frame))
+        found = self._numbering.push(frame)
+        return self._made(() if found is None else (found,))
 
     def rest(self) -> list[tuple[Sample, int]]:
         """Return the samples that wait for later SYNCs."""
-        return self._made(self._numbering.rest())
+        return self._made(iter(self._numbering.pop, None))
 
     def _made(self, numbered: Iterable[Numbered]) -> list[tuple[Sample, int]]:
         found = []

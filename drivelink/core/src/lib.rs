@@ -12,6 +12,7 @@ pub mod latency;
 pub mod layout;
 pub mod mcap;
 pub mod node;
+pub mod numbering;
 pub mod pipeline;
 #[cfg(feature = "python")]
 pub mod python;

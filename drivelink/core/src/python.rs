@@ -3,6 +3,7 @@
 mod assembler;
 mod latency;
 mod mcap;
+mod numbering;
 mod pipeline;
 mod tick;
 mod values;
@@ -38,6 +39,8 @@ mod extension {
     use super::latency::LatencyHistogram;
     #[pymodule_export]
     use super::mcap::{JsonNumbers, McapMessage, McapMessages, json_frame};
+    #[pymodule_export]
+    use super::numbering::SyncNumbering;
     #[pymodule_export]
     use super::pipeline::JointPipeline;
     #[pymodule_export]

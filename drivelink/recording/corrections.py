@@ -13,7 +13,6 @@ from drivelink.errors import RecordingError
 from drivelink.jointfile import DriveSection, EncoderSection, JointFile
 from drivelink.recording.canframes import is_frame_log
 from drivelink.recording.columns import record_of_samples
-from drivelink.recording.limits import MAX_SAMPLES
 from drivelink.recording.playback import Played
 from estimator.errors import EstimatorError
 from estimator.gate import Change, Discrepancy, Judgement, check, is_held, judge
@@ -90,7 +89,7 @@ class Gathered:
         """Return findings with corrections, or what the motion does not reveal, one line each."""
         model, judgement = self._joint.model(), Judgement(reason="no samples in one run of numbers")
         try:
-            record = _record_of(self._samples, model, self._period_s)
+            record = _record_of(self._samples, model, self._period_s, self._most)
             if record is not None:
                 judgement = judge(record, model)
         except EstimatorError as error:
@@ -99,15 +98,21 @@ class Gathered:
         return [] if decided else [_line(self._joint, judgement, live=live)]
 
 
-def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) -> Record | None:
-    """Return the complete samples as a recording; None if they are not one run."""
+def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float, most: int) -> Record | None:
+    """Return the complete samples as a recording; None if they are not one run.
+
+    Of a run with gaps, the `most` periods that have the most samples: the judge allocates the gaps.
+    """
     rows = [s for s in samples if np.all(np.isfinite((*s.motor_position_rad, *s.motor_torque_nm)))]
     linked = model.has_deflection
     rows = [s for s in rows if not linked or math.isfinite(s.link_position_rad)]
     sequence = np.array([s.sequence for s in rows], dtype=np.int64)
-    if len(rows) < 3 or np.any(np.diff(sequence) < 1):  # restarted numbering: two runs in one file
+    if np.any(np.diff(sequence) < 1) or not rows:  # restarted numbering: two runs in one file
         return None
-    if sequence[-1] - sequence[0] > MAX_SAMPLES:  # the judge allocates the gaps
+    counts = np.searchsorted(sequence, sequence + most) - np.arange(len(rows))
+    begin = int(np.argmax(counts))
+    rows = rows[begin : begin + int(counts[begin])]
+    if len(rows) < 3:
         return None
     record = record_of_samples(rows, len(model.motors), period_s, "samples")
     link = record.link_position_rad if linked else None

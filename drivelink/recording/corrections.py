@@ -103,8 +103,8 @@ def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float, mo
 
     Of a run with gaps, the `most` periods that have the most samples: the judge allocates the gaps.
     """
-    rows = [s for s in samples if np.all(np.isfinite((*s.motor_position_rad, *s.motor_torque_nm)))]
     linked = model.has_deflection
+    rows = [s for s in samples if all(map(math.isfinite, (*s.motor_position_rad, *s.motor_torque_nm)))]
     rows = [s for s in rows if not linked or math.isfinite(s.link_position_rad)]
     sequence = np.array([s.sequence for s in rows], dtype=np.int64)
     if np.any(np.diff(sequence) < 1) or not rows:  # restarted numbering: two runs in one file

@@ -203,6 +203,7 @@ def faults(drawn: Drawn) -> dict[str, dict[str, float]]:
         found[f"motor {i} torque reversed"] = {torque: -1.0}
         if linked:
             found[f"motor {i} position in degrees"] = {position: degree}
+            found[f"motor {i} position taken for degrees"] = {position: 1.0 / degree}
         if drawn.model.motors[i - 1].flexible and len(motors) > 1:
             found[f"motor {i} reversed"] = {position: -1.0, torque: -1.0}
         if len(motors) > 1:

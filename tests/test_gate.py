@@ -92,6 +92,14 @@ def test_each_fault_is_named(kind):
             assert named(list(judgement.findings), factors), (kind, name, judgement)
 
 
+@pytest.mark.parametrize("channel", ["motor1_position", "link_position"])
+def test_radians_that_were_taken_for_degrees_are_named(channel):
+    drawn = gatekit.draw("antagonistic", 0, effects=False, seconds=6.0)
+    factors = {channel: 1.0 / DEGREE}
+    judgement = judge(gatekit.faulty(drawn.record, factors), drawn.model)
+    assert named(list(judgement.findings), factors), judgement
+
+
 @pytest.mark.parametrize(
     "kind", [k if k == "soft" else pytest.param(k, marks=pytest.mark.slow) for k in gatekit.KINDS]
 )

@@ -101,13 +101,15 @@ def _all(channels: Sequence[str], factor: float) -> tuple[Change, ...]:
 
 
 def _units(positions: list[str], torques: list[str], linked: bool) -> list[Cause]:
-    degrees, small, large = "looks like degrees, expected rad", "N·mm", "kN·m"
+    degrees, radians = "looks like degrees, expected rad", "looks like radians that were taken for degrees"
+    small, large = "N·mm", "kN·m"
     everywhere = [*positions, _LINK] if linked else positions
     groups = [everywhere, *([[_LINK]] if linked else [])]
     groups += [[position] for position in positions] if len(everywhere) > 1 else []
     if linked and len(positions) > 1:
         groups.append(positions)
     found = [Cause("unit", degrees, _all(group, _DEGREE)) for group in groups]
+    found += [Cause("unit", radians, _all(group, 1.0 / _DEGREE)) for group in groups]
     for group in (torques, *([[t] for t in torques] if len(torques) > 1 else [])):
         found.append(Cause("unit", f"looks like {small}, expected N·m", _all(group, _MILLI)))
         found.append(Cause("unit", f"looks like {large}, expected N·m", _all(group, 1e3)))

@@ -1,4 +1,5 @@
 import io
+import re
 
 import pytest
 from daemonkit import served
@@ -114,6 +115,9 @@ def test_a_bus_without_a_drive_is_one_line_and_names_of_devices_cannot_break_the
 
 def test_the_examples_are_copied_once(tmp_path, capsys):
     assert main(["new", "--examples", str(tmp_path)]) == 0
+    for page in (tmp_path / "examples").rglob("*.md"):  # beside it is no checkout
+        links = re.findall(r"\]\(([^):]+)\)", page.read_text(encoding="utf-8"))
+        assert all((page.parent / link).exists() for link in links), links
     assert (tmp_path / "examples" / "close_the_loop.py").exists()
     assert main(["new", "--examples", str(tmp_path)]) == 2
     assert "is there already" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import sys
@@ -240,3 +241,12 @@ def test_the_time_is_in_the_name_or_in_the_unix_stamps(name, moment, tmp_path):
     path = tmp_path / "elbow-2020-01-01.csv"
     path.write_text("# a comment\ntime_s;motor1_position_rad\n1780000000,5;1\n")
     assert task.recorded_time(path, source(path)) == datetime.fromtimestamp(1780000000.5, UTC)
+
+
+def test_what_the_extra_would_have_brought_is_named(monkeypatch, capsys):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "cryptography" else find(name)
+    )
+    assert main(["fleet", "recordings", "--joints", "joints"]) == 2
+    assert "fleet needs cryptography: install the extra" in capsys.readouterr().err

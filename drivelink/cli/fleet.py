@@ -19,7 +19,7 @@ from drivelink.plaintext import clean_text
 if TYPE_CHECKING:
     from drivelink.fleet.runner import Counts, Settings
 
-_NEEDS = ("distributed", "fsspec", "pyarrow")
+_NEEDS = ("cryptography", "distributed", "fsspec", "pyarrow")
 _REPORT = "report"
 _WARNINGS = 20  # shown lines about single recordings; the table has all
 _FALSE_SHARE = 0.05  # of all changes that a report names, expected to be chance

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,16 +12,14 @@ from typing import TYPE_CHECKING, Any
 from drivelink import jointfile, recording
 from drivelink.errors import HarmfulModelError, RecordingError, UsageError
 from drivelink.files import check_target
-from drivelink.jointfile import JointText, apply_diagnosis
+from drivelink.jointfile import apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import as_read, diagnosed_model, floor_entry
 from drivelink.output import fitreport, plots, report, sentences
 from drivelink.output import motion as motions
 from drivelink.output.comparison import beside, fits, simulated
 from drivelink.output.document import Section, as_text, write
-from drivelink.output.numbers import Units
 from drivelink.recording.columns import parse_column_map
-from drivelink.recording.corrections import gate
-from drivelink.recording.mapping import joint_of
+from drivelink.runs import Paths, Runs, Warn, load
 from estimator.diagnosis import Diagnosis
 from estimator.diagnosis import diagnose as _diagnose
 from estimator.diagnosis.fourier import Limits
@@ -38,9 +35,6 @@ from estimator.transmissions import RIGID
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Paths = str | Path | Sequence[str | Path]
-Warn = Callable[[Path, Sequence[str]], None]
-
 
 @dataclass(frozen=True, slots=True)
 class Picture:
@@ -54,32 +48,6 @@ class Picture:
     def save(self, path: str | Path) -> Path:
         """Write it in the format of the file name's ending (png, svg, pdf)."""
         return plots.save(self.figure, Path(path))
-
-
-@dataclass(frozen=True, slots=True)
-class Runs:
-    """Recordings of one joint, as read."""
-
-    source: JointText  # the joint file, given or carried by the first recording
-    paths: tuple[Path, ...]  # of the recordings
-    records: tuple[Record, ...]  # their values
-    notes: tuple[str, ...]  # what the gate says of units, signs, gears and time
-    names: tuple[str, ...] = ()  # columns of others under our names
-
-    @property
-    def names_of_files(self) -> list[str]:
-        """The names of the files, without their folders."""
-        return [path.name for path in self.paths]
-
-    @property
-    def named(self) -> str:
-        """The same in one line."""
-        return ", ".join(self.names_of_files)
-
-    @property
-    def units(self) -> Units:
-        """Units of a rotary or linear axis."""
-        return Units(self.source.joint.axis == "linear")
 
 
 @dataclass(frozen=True)
@@ -327,35 +295,6 @@ class Diagnosed:
         if self.held is not None:
             return harm(joint.model(), written, [Unseen.whole(self.held)], joint.estimator)
         return harm_of_parts(joint.model(), written, records, make, joint.estimator)
-
-
-def load(
-    recordings: Paths,
-    joint: str | Path | None = None,
-    *,
-    names: Sequence[str] = (),
-    strict: bool = False,
-    warn: Warn | None = None,
-) -> Runs:
-    """Read recordings of one joint and check units, signs, gears and time; arguments as of `fit`."""
-    several = [recordings] if isinstance(recordings, str | Path) else recordings
-    paths = tuple(Path(path) for path in several)
-    if not paths:
-        raise RecordingError("expected a recording, got none")
-    source = joint_of(paths[0], None if joint is None else Path(joint))
-    columns = parse_column_map(names)
-    read = [recording.read(path, source.joint, base_dir=source.folder, names=columns) for path in paths]
-    notes: list[str] = []
-    for path, record in zip(paths, read, strict=True):
-        said = gate(path, source.joint, record, strict=strict)
-        (warn or _warn)(path, said)
-        notes += said
-    return Runs(source, paths, tuple(read), tuple(dict.fromkeys(notes)), tuple(names))
-
-
-def _warn(path: Path, lines: Sequence[str]) -> None:
-    for line in lines:
-        warnings.warn(f"{path}: {line}", stacklevel=4)
 
 
 def fit(

@@ -80,9 +80,7 @@ class DriveSection(_Section):
     """The drive of one motor. Values that the drive reports may be left out."""
 
     node_id: int = Field(ge=1, le=127, description="CANopen node id")
-    counts_per_rev: float | None = Field(
-        None, gt=0, description="encoder counts per motor revolution (0x608F)"
-    )
+    counts_per_rev: float | None = Field(None, gt=0, description="counts per motor revolution (0x608F)")
     gear_ratio: float = Field(1.0, gt=0, description="motor revolutions per joint revolution (0x6091)")
     torque_constant_nm_a: float | None = Field(
         None, gt=0, description="torque at the motor shaft per ampere; turns a current into a torque"

@@ -18,7 +18,7 @@ use estimator_core::sample::{MOTORS, Sample};
 use crate::cross_check::CrossCheck;
 use crate::frames::TpdoDecoder;
 use crate::node::Node;
-use status::{BUS_FAULT, DRIVE_FAULT, NODE_RESTARTED, UNTIMED};
+use status::{BUS_FAULT, NODE_RESTARTED, UNTIMED};
 
 /// Bits of an estimate's status that the service adds.
 pub mod status {
@@ -389,20 +389,6 @@ impl Assembler {
             link_position: self.values[3 * m],
             link_velocity: self.values[3 * m + 1],
             external_torque: f64::NAN,
-        }
-    }
-
-    fn node_and_decoders(&mut self, node: usize) -> (&mut Node, impl Iterator<Item = &mut TpdoDecoder>) {
-        (&mut self.nodes[node], self.decoders.iter_mut().filter(move |decoder| decoder.node == node))
-    }
-
-    fn note_news(&mut self) {
-        self.faulted = 0;
-        for node in &mut self.nodes {
-            if node.faulted || node.emergency != 0 {
-                self.faulted = DRIVE_FAULT;
-            }
-            self.restart |= std::mem::replace(&mut node.restarted, false);
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use estimator_core::sample::MOTORS;
 
-use super::status::CONTRADICTED;
+use super::status::{CONTRADICTED, DRIVE_FAULT};
 use super::{Assembler, COB_IDS, Receiver, SYNC_COB_ID, VALUES};
 use crate::frames::TpdoDecoder;
 use crate::layout::{self, Signal};
@@ -174,6 +174,23 @@ impl Assembler {
         if let Some(node) = self.nodes.iter().position(|node| node.node_id == node_id) {
             let (node, decoders) = self.node_and_decoders(node);
             node.trust(decoders);
+        }
+    }
+
+    pub(super) fn node_and_decoders(
+        &mut self,
+        node: usize,
+    ) -> (&mut Node, impl Iterator<Item = &mut TpdoDecoder>) {
+        (&mut self.nodes[node], self.decoders.iter_mut().filter(move |decoder| decoder.node == node))
+    }
+
+    pub(super) fn note_news(&mut self) {
+        self.faulted = 0;
+        for node in &mut self.nodes {
+            if node.faulted || node.emergency != 0 {
+                self.faulted = DRIVE_FAULT;
+            }
+            self.restart |= std::mem::replace(&mut node.restarted, false);
         }
     }
 }

@@ -111,6 +111,8 @@ def effects(rng: np.random.Generator, rated: float, stiffness: float) -> dict[st
         "damping 20 % off": {},
         "motor of 1024 counts": {"motor_counts": 1024},
         "torque noise 2 % of rated": {"torque_noise": 0.02 * rated},
+        "torque behind a filter of 10 ms": {"torque_lag": 0.01},
+        "eccentric link encoder": {"eccentricity": rng.uniform(0.2e-3, 2e-3)},
     }
 
 

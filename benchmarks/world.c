@@ -26,8 +26,8 @@ static double spring, stiffness = 150, cubic = 5000, exponent = 6, linkage = 1.7
 static double link_inertia = 0.45, link_damping = 0.5, gravity = 3;
 static double friction, coulomb = 0.3, stribeck = 0.5, stribeck_velocity = 0.05, bristle = 2e-3, bristle_damping = 0.3;
 static double gear_loss, hysteresis, hysteresis_torque = 0.3, hysteresis_width = 4e-3, backlash, rounding = 0.25;
-static double transmission_damping, cogging, cogging_periods = 32, link_delay, motor_counts = 8192, link_bits = 17;
-static double torque_delay, torque_noise, motion, size = 7, top_hz = 3, push = 5, pull, seconds = 30, period = 1e-3, seed = 1;
+static double transmission_damping, cogging, cogging_periods = 32, link_delay, motor_counts = 8192, link_bits = 17, eccentricity;
+static double torque_delay, torque_lag, torque_noise, motion, size = 7, top_hz = 3, push = 5, pull, seconds = 30, period = 1e-3, seed = 1;
 
 static const struct setting {
     const char *name;
@@ -63,7 +63,9 @@ static const struct setting {
     {"motor_counts", &motor_counts, 0, "per turn of the joint; 0: exact"},
     {"link_bits", &link_bits, 0, "2^bits per turn of the joint; 0: exact"},
     {"torque_delay", &torque_delay, 0, "of the reported torque, s: half a period where it is sampled and not held"},
-    {"torque_noise", &torque_noise, 0, "standard deviation, N·m"},
+    {"eccentricity", &eccentricity, 0, "of the link encoder, rad: it reads q + this sin q"},
+    {"torque_lag", &torque_lag, 0, "of a drive's filter of the reported torque, s"},
+    {"torque_noise", &torque_noise, 0, "standard deviation before it, N·m"},
     {"motion", &motion, "multisine point-to-point hand-guided pushes harmonic played", "what moves the joint"},
     {"size", &size, 0, "amplitude of the motor's torque, N·m; point-to-point: largest step, rad"},
     {"top_hz", &top_hz, 0, "fastest sine, or the harmonic one"},
@@ -272,7 +274,7 @@ int main(int count, char **arguments) {
     static double link[LONGEST_DELAY]; /* of the last sub-steps */
     if (count == 2 && !strcmp(arguments[1], "help")) return help(), 0;
     for (int i = 1; i < count; i++) set(arguments[i]);
-    double h = period / SUBSTEPS, x[STATES] = {0};
+    double h = period / SUBSTEPS, x[STATES] = {0}, shown = 0;
     long late = lround(link_delay / h), step = 0;
     if (!(h > 0) || !(inertia > 0) || !(link_inertia > 0) || late >= LONGEST_DELAY ||
         torque_delay > 50 * period)
@@ -287,9 +289,10 @@ int main(int count, char **arguments) {
         if (!isfinite(torque)) return fprintf(stderr, "at %g s the joint diverges: check the settings\n", t), 1;
         link[step % LONGEST_DELAY] = x[2];
         double seen = link[(step >= late ? step - late : 0) % LONGEST_DELAY];
+        double measured = reported(motor, k) + (torque_noise ? torque_noise * normal() : 0);
+        shown += (torque_lag > 0 ? 1 - exp(-period / torque_lag) : 1) * (measured - shown);
         printf("%.6f,%.12g,%.12g,%.12g,%.12g,%.12g,%.12g,%.12g\n", t, read_encoder(x[0], motor_counts),
-               reported(motor, k) + (torque_noise ? torque_noise * normal() : 0), read_encoder(seen, link_bits ? exp2(link_bits) : 0),
-               slope, torque, spring_only, external);
+               shown, read_encoder(seen + eccentricity * sin(seen), link_bits ? exp2(link_bits) : 0), slope, torque, spring_only, external);
         for (int i = 0; i < SUBSTEPS; i++) {
             advance(x, motor, external_torque(t + i * h), h);
             step++;

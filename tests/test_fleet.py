@@ -249,4 +249,4 @@ def test_what_the_extra_would_have_brought_is_named(monkeypatch, capsys):
         importlib.util, "find_spec", lambda name: None if name == "cryptography" else find(name)
     )
     assert main(["fleet", "recordings", "--joints", "joints"]) == 2
-    assert "fleet needs cryptography: install the extra" in capsys.readouterr().err
+    assert "drivelink fleet: needs cryptography: install the extra" in capsys.readouterr().err

@@ -159,7 +159,7 @@ def test_a_ctrl_c_that_a_finaliser_discards_ends_the_run_all_the_same():
         ("{recordings} --joints {joints} --memory=-1GiB", "--memory: expected a size"),
         ("{recordings} --joints {joints} --since soon", "--since: expected a date"),
         ("nosuch://x/*.csv --joints {joints}", "nosuch://x/*.csv: cannot be reached"),
-        ("report", "fleet report: expected one folder"),
+        ("report", "drivelink fleet: report: expected one folder"),
         ("report nowhere", "expected a table of `drivelink fleet`"),
         ("{recordings} --joints {joints} --scheduler tcp://127.0.0.1:1", "expected tls://HOST:PORT: without TLS anybody who reaches"),
         ("{recordings} --joints {joints} --scheduler 127.0.0.1:1", "expected tls://HOST:PORT"),

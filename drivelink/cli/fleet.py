@@ -89,12 +89,10 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     missing = [name for name in _NEEDS if importlib.util.find_spec(name) is None]
     if missing:
-        raise UsageError(
-            f"fleet needs {', '.join(missing)}: install the extra, pip install 'drivelink-vsa[fleet]'"
-        )
+        raise UsageError(f"needs {', '.join(missing)}: install the extra, pip install 'drivelink-vsa[fleet]'")
     if args.recordings[0] == _REPORT and args.joints is None:
         if len(args.recordings) != 2:
-            raise UsageError("fleet report: expected one folder of results")
+            raise UsageError("report: expected one folder of results")
         _report(args.recordings[1], as_json=args.json)
         return 0
     return _run(args)

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
     root = args.root or Path("/")
     if args.root is None and os.geteuid() != 0:
-        raise UsageError("service: writes below /etc: run it with sudo, or name a folder with --root")
+        raise UsageError("writes below /etc: run it with sudo, or name a folder with --root")
     return _install(args, root) if args.action == "install" else _uninstall(args, root)
 
 
@@ -131,7 +131,7 @@ def _executable() -> Path:
     beside = Path(sys.executable).with_name("drivelink")
     found = beside if beside.exists() else Path(shutil.which("drivelink") or "")
     if not found.is_file():
-        raise UsageError("service: drivelink is not installed as a program: pip install it, then try again")
+        raise UsageError("drivelink is not installed as a program: pip install it, then try again")
     return found.absolute()
 
 

@@ -363,10 +363,9 @@ class JointView:
 
 def flags(status: int) -> list[tuple[str, str]]:
     """Return the status bits with their styles: validity, what forbids use (red), the rest."""
-    found = [
-        ("valid", "green") if status & Status.VALID else ("not valid", "red"),
-        ("observable", "green") if status & Status.OBSERVABLE else ("not observable", "yellow"),
-    ]
+    found = [("valid", "green") if status & Status.VALID else ("not valid", "red")]
+    if not status & Status.STALE:  # of no motion nobody knows what it reveals
+        found.append(("observable", "green") if status & Status.OBSERVABLE else ("not observable", "yellow"))
     if status & (Status.VALID | Status.TORQUE_VALID) == Status.TORQUE_VALID:
         found.append(("torque valid", "green"))
     bits = sorted((bit for bit in Status if status & bit & ~_UNSHOWN), key=lambda bit: not bit & _UNUSABLE)

@@ -168,7 +168,7 @@ def dbc_text(joint: str, layouts: Iterable[NodeLayout]) -> str:
         from cantools.database import Database, Message
         from cantools.database.can import Node
     except ImportError as error:
-        raise UsageError("dbc needs cantools: pip install 'drivelink-vsa[dbc]'") from error
+        raise UsageError("needs cantools: pip install 'drivelink-vsa[dbc]'") from error
     layouts = list(layouts)
     messages = [
         Message(

@@ -3,7 +3,7 @@
 //! Adds the service's status bits: drive faults, missing frames, stale estimates.
 
 use estimator_core::external::External;
-use estimator_core::sample::status::{MODEL_ALARM, RESTARTED, USABLE, VALID};
+use estimator_core::sample::status::{MODEL_ALARM, OBSERVABLE, RESTARTED, USABLE, VALID};
 use estimator_core::sample::{Estimate, Sample};
 
 use crate::assembler::status::{CONTRADICTED, NODE_RESTARTED, STALE, UNTIMED};
@@ -154,8 +154,8 @@ impl Pipeline {
     pub fn carry_on(&mut self, sequence: i64, flags: u32, stamp_ns: Option<i64>) -> Option<Tick> {
         let Tick { mut estimate, external, motors, .. } = self.last?;
         estimate.sequence = sequence as u64;
-        // Neither is true of an estimate that is carried on.
-        estimate.status = estimate.status & !(USABLE | NODE_RESTARTED) | STALE | flags;
+        // None of these is true of an estimate that is carried on.
+        estimate.status = estimate.status & !(USABLE | OBSERVABLE | NODE_RESTARTED) | STALE | flags;
         let external = external.map(|external| external.void(estimate.sequence));
         Some(self.publish((estimate, external), None, motors, stamp_ns))
     }
@@ -320,7 +320,8 @@ mod tests {
         let mut pipeline = Pipeline::default();
         assert!(pipeline.carry_on(1, 0, None).is_none());
         let mut fixed = Fixed { stiffness: 150.0, alarm: false, told: Vec::new() };
-        let results = estimate(&mut fixed, &SAMPLE, 0, 0.0).unwrap();
+        let mut results = estimate(&mut fixed, &SAMPLE, 0, 0.0).unwrap();
+        results.0.status |= OBSERVABLE;
         pipeline.conclude(&SAMPLE, 1, results, Some(9));
         let tick = pipeline.carry_on(6, 0, Some(10)).unwrap();
         assert_eq!((tick.estimate.sequence, tick.estimate.status, tick.stamp_ns), (6, STALE, 10));

@@ -8,6 +8,7 @@ import shutil
 import sys
 import sysconfig
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -160,10 +161,7 @@ def _new_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
         answers = _scanned(answers)
     elif sys.stdin.isatty() and str(args.path) != "-" and not args.json:
         _ask(answers, {key for key, value in given.items() if value is not None})
-    if answers.motors > 1 and answers.model == "none":
-        raise UsageError(f"transmission: expected a flexible one of {answers.arrangement} motors, got none")
-    if answers.encoder == "none" and answers.model != "none":
-        raise UsageError(f"--encoder none: expected --model none, as {answers.model} needs a link encoder")
+    _require_possible(answers)
     if answers.rotor_inertia_gcm2 is not None and answers.gear_ratio is None:
         raise UsageError(
             "--rotor-inertia: expected --gear, whose square reflects it to the joint; 1 for a direct drive"
@@ -175,6 +173,13 @@ def _new_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
             "motor.inertia_kg_m2 is a placeholder: set --rotor-inertia (g·cm²) and --gear, or --inertia"
         )
     return text, answers.name, remarks
+
+
+def _require_possible(answers: Answers) -> None:
+    if answers.motors > 1 and answers.model == "none":
+        raise UsageError(f"transmission: expected a flexible one of {answers.arrangement} motors, got none")
+    if answers.encoder == "none" and answers.model != "none":
+        raise UsageError(f"--encoder none: expected --model none, as {answers.model} needs a link encoder")
 
 
 def _encoder(text: str | None) -> str | None:
@@ -223,7 +228,8 @@ def _ask(answers: Answers, known: set[str]) -> None:
             if key in known or (key == "rotor_inertia_gcm2" and "inertia_kg_m2" in known):
                 continue
             needed = key in ("gear_ratio", "rotor_inertia_gcm2")  # no drive reports them
-            setattr(answers, key, _asked(question, getattr(answers, key), _check(option), needed=needed))
+            check = _fitting(answers, key, _check(option))
+            setattr(answers, key, _asked(question, getattr(answers, key), check, needed=needed))
             if key == "rotor_inertia_gcm2":
                 print(f"  at the joint: {answers.conversion}")
         if "nodes" not in known:
@@ -231,7 +237,7 @@ def _ask(answers: Answers, known: set[str]) -> None:
                 answers.nodes.append(_asked(f"Node id of the drive of motor {motor}", motor, _check("node")))
         if "encoder" not in known:
             question = "Link encoder: drive, none, or node id of a CiA 406 encoder"
-            answers.encoder = _asked(question, answers.encoder, _encoder) or answers.encoder
+            answers.encoder = _asked(question, answers.encoder, _fitting(answers, "encoder", _encoder))
     except EOFError:
         raise UsageError("the questions were not answered; options answer them, too: --help") from None
 
@@ -248,6 +254,17 @@ def _check(option: str) -> Callable[[str], Any]:
         return action.type(reply) if callable(action.type) else reply
 
     return check
+
+
+def _fitting(answers: Answers, key: str, check: Callable[[str], Any]) -> Callable[[str], Any]:
+    """Return a check that also refuses what contradicts the earlier answers."""
+
+    def fits(reply: str) -> Any:
+        value = check(reply)
+        _require_possible(replace(answers, **{key: value}))
+        return value
+
+    return fits
 
 
 def _asked(question: str, default: Any, check: Callable[[str], Any], *, needed: bool = False) -> Any:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from drivelink.daemon.jointwatch import JointWatch
+from drivelink.daemon.jointwatch import JointWatch, WatchedNode
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from drivelink.plaintext import PlainFormatter
@@ -151,3 +151,18 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(events,
     said = "elbow: model alarm: the residual is 3 times its baseline, likely at the transmission"
     assert begun.startswith(said) and "drivelink diagnose" in begun
     assert over == "elbow: the model alarm is over"
+
+
+def test_a_second_device_is_reported_whenever_it_begins_where_no_frame_is_missing():
+    """The end of a second without missing frames is no missing frame."""
+    zero = {"received": 0, "missing": 0, "wrong_length": 0, "conflicting": 0, "ignored": 0}
+    for begins in range(0, 20):  # tenths of a second
+        counters = SimpleNamespace(**zero)
+        assembler = SimpleNamespace(counters={2: counters})
+        joint = SimpleNamespace(pipeline=SimpleNamespace(assembler=assembler))
+        node, events = WatchedNode(SimpleNamespace(node_id=2), joint, 0), EventLog(logging.getLogger("t"))
+        node.begin(SimpleNamespace(**zero), 0)
+        for tenth in range(40):
+            counters.conflicting += 10 * (begins <= tenth < begins + 2)
+            node.check_counters(events, tenth * 100_000_000)
+        assert any("different frames" in event["text"] for event in events.recent()), begins

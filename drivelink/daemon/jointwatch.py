@@ -195,6 +195,7 @@ class WatchedNode:
         self.state = OPERATIONAL
         self.seen_ns = self.heartbeat_ns = self.attempt_ns = now_ns
         self.bunched_ns = 0  # start of missing and multiple frames; 0: none
+        self.missed_ns = -_NS  # when a frame was last missing
         self.received = counters.received
         self.sent = counters.received + counters.ignored
         self.counted = {name: (getattr(counters, name), -_NS) for name, *_ in _COUNTED}
@@ -226,7 +227,8 @@ class WatchedNode:
             count, (before, since_ns) = getattr(counters, name), self.counted[name]
             if count - before >= least:
                 self.counted[name] = (count, now)
-                if name == "conflicting" and now - self.counted["missing"][1] < _BUNCH_NS:
+                self.missed_ns = now if name == "missing" else self.missed_ns
+                if name == "conflicting" and now - self.missed_ns < _BUNCH_NS:
                     self.bunched_ns = self.bunched_ns or now
                     if now - self.bunched_ns < _BUNCHES_NS:
                         continue  # a second device sends more frames, not fewer

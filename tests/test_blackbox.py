@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import math
 import os
 import shutil
 import signal
 import threading
 import time
+import tracemalloc
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,6 +30,7 @@ from drivelink.loop import blackbox
 from drivelink.loop.blackbox import AFTER_S, BlackBox
 from drivelink.loop.finding import drop_oldest, event_of, kept, taken, wish_of
 from drivelink.loop.queue import next_due
+from drivelink.pubsub import wire
 from drivelink.pubsub.feed import DECODERS
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.mapping import joint_of
@@ -135,11 +139,26 @@ def test_memory_holds_no_more_than_is_kept_and_ten_alarms_a_minute_make_one_reco
     scene = Scene(tmp_path)
     scene.run(2000)
     reach_s = 10.0 + 12.0 + 2 * AFTER_S  # before, a state before that, after, and until it is written
-    assert len(scene.box._ring) <= 3 * (reach_s / PERIOD_S + 1)
+    held = list(scene.box._ring.between(-math.inf, math.inf))
+    assert len(held) <= 3 * ((reach_s + 2.0) / PERIOD_S + 1)  # in whole seconds
     for _ in range(10):  # the last one within a minute of the first
         scene.run(24, Status.MODEL_ALARM)
         scene.run(24)
     assert len(scene.finish()) == 1
+
+
+def test_a_cycle_takes_no_more_memory_than_its_messages_take_on_the_wire(tmp_path):
+    scene = Scene(tmp_path)
+    scene.box._clock = lambda: scene.cycle * 1e-3
+    scene.run(10)
+    gc.collect()
+    tracemalloc.start()
+    scene.run(cycles := 3001)
+    gc.collect()
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    frame = 8 + 4 + 8  # its stamp, its identifier, its data
+    assert held < cycles * (frame + wire.SAMPLE.size(1) + wire.ESTIMATE.size(1))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -29,6 +29,7 @@ from drivelink.loop.finding import (
     taken,
     wish_of,
 )
+from drivelink.loop.ring import Item, Ring
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.sinks import McapSink, Sink
 from estimator.sample import Sample, Status
@@ -39,7 +40,6 @@ AFTER_S = 15.0  # that is kept after an event
 _QUIET_S = 60.0  # in which the same cause is not kept again
 _STATE_S = 12.0  # between two states of the estimator, at most
 _LATE_S = 1.0  # that a state may come after its sample
-_ITEMS_PER_S = 25_000  # frames of a full bus at 1 Mbit/s, samples and estimates: bounds the memory
 _BLOCK = 20_000  # items between two syncs to disk
 _FLAGS = {
     Status.MODEL_ALARM: "model alarm",
@@ -81,10 +81,9 @@ class BlackBox(Sink):
         self._wish = wish_of(text)
         self._folder = self._wish.parent
         self._day = Day(self._folder, text.joint.name)
-        self._reach_s = self._section.keep_s + AFTER_S + _STATE_S
-        self._ring: deque[tuple[float, str, tuple[Any, ...]]] = deque(
-            maxlen=int(self._reach_s * _ITEMS_PER_S)
-        )
+        self._reach_s = self._section.keep_s + _STATE_S + 2 * AFTER_S  # until it is written
+        self._ring = Ring(self._reach_s)
+        self._states: deque[tuple[float, bytes]] = deque()
         self._mapping: tuple[dict[str, Any], int] | None = None
         self._model: tuple[str, bytes, int] | None = None
         self._model_s = -math.inf  # when it took the place of another
@@ -155,7 +154,11 @@ class BlackBox(Sink):
 
     def snapshot(self, state: bytes) -> None:
         """Store the estimator's state, with which a recording begins: a replay goes on from it."""
-        self._take("snapshot", state)
+        now_s = self._clock()
+        self._states.append((now_s, state))
+        while self._states[0][0] < now_s - self._reach_s:
+            self._states.popleft()
+        self.counts["snapshot"] += 1
 
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
         """Store the mapping document: every recording begins with it."""
@@ -208,33 +211,23 @@ class BlackBox(Sink):
                 _LOG.error("%s: the black box goes on with the joint file before it", error)
 
     def _take(self, kind: str, *values: Any) -> None:
-        now_s = self._clock()
-        ring, oldest_s = self._ring, now_s - self._reach_s - AFTER_S
-        ring.append((now_s, kind, values))
-        while ring[0][0] < oldest_s:
-            ring.popleft()
+        self._ring.take((self._clock(), kind, values))
         self.counts[kind] += 1
 
     def _begin(self, event: _Event) -> threading.Thread:
         first, last = event.at_s - self._section.keep_s, event.at_s + AFTER_S
-        states = [
-            (at_s, values)
-            for at_s, kind, values in self._ring
-            if kind == "snapshot" and self._model_s <= at_s <= event.at_s
-        ]
-        items: list[tuple[str, tuple[Any, ...]]] = []
+        states = [one for one in self._states if self._model_s <= one[0] <= event.at_s]
+        state: bytes | None = None
         if states:
-            at_s, values = next((state for state in reversed(states) if state[0] <= first), states[0])
-            items.append(("snapshot", values))
+            at_s, state = next((one for one in reversed(states) if one[0] <= first), states[0])
             first = min(first, at_s - _LATE_S)
-        within = (item for item in self._ring if first <= item[0] <= last)
-        items += [(kind, values) for _, kind, values in within if kind != "snapshot"]
+        items = self._ring.between(first, last)
         self._event = None
-        self._writer = threading.Thread(target=self._write, args=(event, items), name="black box")
+        self._writer = threading.Thread(target=self._write, args=(event, state, items), name="black box")
         self._writer.start()
         return self._writer
 
-    def _write(self, event: _Event, items: Sequence[tuple[str, tuple[Any, ...]]]) -> None:
+    def _write(self, event: _Event, state: bytes | None, items: Iterable[Item]) -> None:
         """Write one recording; what goes wrong is one line, and no half of a file stays."""
         sink: McapSink | None = None
         name, wall = self._text.joint.name, event.wall
@@ -252,7 +245,9 @@ class BlackBox(Sink):
                 sink.mapping(*self._mapping)
             if self._model is not None:
                 sink.document(*self._model)
-            for number, (kind, values) in enumerate(items, start=1):
+            if state is not None:
+                sink.snapshot(state)
+            for number, (_, kind, values) in enumerate(items, start=1):
                 getattr(sink, kind)(*values)
                 if number % _BLOCK == 0:
                     sink.flush()

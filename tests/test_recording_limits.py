@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import pkgutil
 import re
 import struct
 import time
@@ -21,7 +22,7 @@ from fuzzparsers import JOINT, RECORDINGS, TEXT, frames, held, read_every_way, w
 from drivelink._core import JsonNumbers, SyncNumbering
 from drivelink.canopen.eds import load_eds
 from drivelink.errors import DrivelinkError, RecordingError
-from drivelink.jointfile import ZenohSection, load
+from drivelink.jointfile import ZenohSection, load, parse
 from drivelink.recording import canframes, corrections, read
 from drivelink.recording.canlog import CAN_FORMATS, LoggedFrame, in_order, read_frames
 from drivelink.recording.corrections import Gathered
@@ -455,6 +456,33 @@ def test_a_megabyte_changes_mappings_less_often_than_it_has_frames(tmp_path):
     path = mcap_of(tmp_path / "r.mcap", [("can", k * 100_000, f.encode()) for k, f in enumerate(frames)])
     with one_line("changes of what its nodes send"):
         read(path, JOINT)
+
+
+def _mapped(entries):
+    return [f"601 2F001A00{entries:02d}000000", "581 60001A0000000000"]
+
+
+@pytest.mark.parametrize(
+    ("what", "again", "passive"),
+    [
+        ("drivelink.cycle.objectcheck._objects", ["000 0101", "080 "], False),
+        ("drivelink.canopen.passivenode.offer", [*_mapped(0), *_mapped(2)], False),
+        ("drivelink.cycle.following.PassiveFollower._judge", ["601 4018100100000000"], True),
+    ],
+)
+def test_what_has_not_changed_is_not_worked_out_again(what, again, passive, tmp_path, monkeypatch):
+    """For each frame it made a megabyte of node starts, of mappings that change or of requests take 2 s."""
+    calls, owner, name = [], *what.rpartition(".")[::2]
+    work = pkgutil.resolve_name(owner)
+    made = getattr(work, name)
+    monkeypatch.setattr(work, name, lambda *a: calls.append(1) or made(*a))
+    heard = ["080 "] * 8 + again * 500
+    frames = [json.dumps({"id": int(f[:3], 16), "data": f[4:]}).encode() for f in heard]
+    path = mcap_of(tmp_path / "r.mcap", [("can", k * 100_000, f) for k, f in enumerate(frames)])
+    joint = parse(TEXT + "[bus]\nconfigure = false\n") if passive else JOINT
+    with one_line("no complete sample"):
+        read(path, joint)
+    assert len(calls) < 10
 
 
 def test_syncs_further_apart_than_any_cycle_are_one_line(tmp_path):

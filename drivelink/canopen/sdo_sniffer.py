@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 Address = tuple[int, int]
 
@@ -33,7 +33,7 @@ class _Transfer:
     asked_s: float  # time of the present request
     due: int | None  # the command that answers it; None: it has been answered
     segmented: bool = False
-    data: bytearray = field(default_factory=bytearray)  # to or from the node so far
+    data: bytes = b""  # to or from the node so far
     answer: bytes = b""  # the last one accepted
     toggle: int = _TOGGLE  # of the present segment
     last: bool = False  # the present segment is the last one
@@ -165,7 +165,7 @@ class SdoSniffer:
             self.values[address] = value
             self.disputed.discard(address)
             self.changes += 1
-        return None if transfer.writing else (address, bytes(transfer.data))
+        return None if transfer.writing else (address, transfer.data)
 
 
 def is_mapping(address: Address) -> bool:
@@ -175,26 +175,23 @@ def is_mapping(address: Address) -> bool:
 
 def written_object(data: bytes) -> Address | None:
     """Return the object that a frame of the master begins to write."""
-    data = _padded(data)
     begins = data and (data[0] >> 5 == _DOWNLOAD or data[0] & 0xE1 == _BLOCK_DOWNLOAD << 5)
-    return _address(data) if begins else None
+    return _address(padded) if begins and (padded := _padded(data)) else None
 
 
 def _padded(data: bytes) -> bytes:
     """The eight bytes of a frame, of which some nodes take fewer; empty: it is none of SDO."""
-    return data.ljust(8, b"\0") if 0 < len(data) <= 8 else b""
+    if len(data) == 8:
+        return data
+    return data.ljust(8, b"\0") if 0 < len(data) < 8 else b""
 
 
 def _begun(data: bytes, now_s: float) -> _Transfer:
-    writing, expedited = data[0] >> 5 == _DOWNLOAD, bool(data[0] & 0x02)
-    return _Transfer(
-        address=_address(data),
-        writing=writing,
-        asked_s=now_s,
-        due=_DOWNLOADED if writing else _UPLOADED,
-        segmented=writing and not expedited,
-        data=bytearray(_expedited(data) if writing and expedited else b""),
-    )
+    if data[0] >> 5 == _UPLOAD:
+        return _Transfer(_address(data), False, now_s, _UPLOADED)
+    if data[0] & 0x02:
+        return _Transfer(_address(data), True, now_s, _DOWNLOADED, False, _expedited(data))
+    return _Transfer(_address(data), True, now_s, _DOWNLOADED, True)
 
 
 def _may_follow(transfer: _Transfer, data: bytes) -> bool:

@@ -151,6 +151,7 @@ class PassiveFollower(MapFollower):
         self._heard = dict.fromkeys(assemblers, (0, 0))  # frames of a node, and the SYNC of the last one
         self._speaking: set[int] = set()  # since the last look, other than by PDOs
         self._since_sync: Counter[int] = Counter()  # such frames of each node since the last SYNC
+        self._joints = tuple(dict.fromkeys(assemblers.values()))
         self._numbers = {node: assembler.sequence for node, assembler in assemblers.items()}
         configurator.adopt(layout for node, layout in layouts.items() if node not in configurator.layouts)
         self._judge()
@@ -169,9 +170,10 @@ class PassiveFollower(MapFollower):
         if cob_id > 0x700 or 0x580 < cob_id < 0x600:
             self._speaking.add(cob_id & 0x7F)
             self._since_sync[cob_id & 0x7F] += 1
-        self._listener.feed(cob_id, data, now_s)
-        self._listener.poll(now_s)
-        self._judge()
+        changed = self._listener.feed(cob_id, data, now_s)
+        if changed or any(assembler.untrusted for assembler in self._joints):
+            self._listener.poll(now_s)
+            self._judge()
 
     def sync(self) -> Sequence[Mismatch]:
         """See `MapFollower.sync`."""

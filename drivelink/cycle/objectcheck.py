@@ -13,6 +13,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import count, islice
 from typing import Any
 
@@ -69,19 +70,29 @@ class _Object:
         return self.mapped[0].signal if self.mapped is not None else None
 
 
-@dataclass(slots=True)
+@dataclass
 class _Node:
-    """One node."""
+    """One node; of most nobody asks an object before they are configured or started again."""
 
+    layout: NodeLayout
+    timeout_s: float
     assembler: Assembler  # of its joint
     samples: Samples
     motor: int  # from 1 on (0: the link's)
     since: int  # the SYNC since which its frames are read as now
-    objects: Mapping[Address, _Object]  # values, then units
-    sniffer: SdoSniffer
     asked: int = -1  # the SYNC before the present request
     answers: deque[_Answer] = field(default_factory=deque)  # not judged yet
     found: Mismatch | None = None  # the value that is contradicted
+
+    @cached_property
+    def objects(self) -> Mapping[Address, _Object]:
+        """Values, then units."""
+        return _objects(self.layout)
+
+    @cached_property
+    def sniffer(self) -> SdoSniffer:
+        """Follows its transfers."""
+        return SdoSniffer(lambda *address: address in self.objects, self.timeout_s)
 
 
 def contradicted(
@@ -123,17 +134,16 @@ class ObjectCheck:
     def watch(self, layout: NodeLayout, assembler: Assembler) -> None:
         """Start checking a node that has been configured."""
         node_id, before = layout.node_id, self._nodes.get(layout.node_id)
-        objects = _objects(layout)
         node = self._nodes[node_id] = _Node(
+            layout=layout,
+            timeout_s=self._timeout_s,
             assembler=assembler,
             samples=self._samples[node_id],
             motor=0 if layout.motor is None else layout.motor + 1,
             since=assembler.sequence,
-            objects=objects,
-            sniffer=SdoSniffer(lambda *address: address in objects, self._timeout_s),
         )
         if before is not None and before.found is not None:
-            if before.found.signal in {one.signal for one in objects.values()}:
+            if before.found.signal in {one.signal for one in node.objects.values()}:
                 node.found = before.found
             else:
                 assembler.contradict(node_id, False)

@@ -31,6 +31,7 @@ __all__ = [
     "Location",
     "Parameter",
     "elements",
+    "in_words",
 ]
 
 Location = Literal["motor", "transmission", "link", "measurement"]
@@ -207,3 +208,8 @@ def elements(effect: Effect) -> tuple[EffectType, list[dict[str, float]]]:
     return kind, [
         {name: v[i] if isinstance(v, tuple) else v for name, v in values.items()} for i in range(count)
     ]
+
+
+def in_words(name: str) -> str:
+    """Return the name of an effect as it stands in a sentence."""
+    return name.replace("_", " ").replace("coulomb", "Coulomb").replace("stribeck", "Stribeck")

@@ -16,14 +16,16 @@ from rich.console import Console
 
 from drivelink.output.document import as_text, show
 from drivelink.output.numbers import Units
-from drivelink.output.report import sections
+from drivelink.output.report import as_json, sections
 from drivelink.output.sentences import sentence
 from estimator import fit
 from estimator.choices import choice
-from estimator.diagnosis import Diagnosis, Errors, Finding, diagnose
+from estimator.diagnosis import Diagnosis, Errors, Finding, advice_for, diagnose
 from estimator.diagnosis.curves import _bases
+from estimator.diagnosis.findings import rivals_of
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.order import bends
+from estimator.diagnosis.probabilities import chances, standing
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Rival
 from estimator.diagnosis.search import Search
@@ -55,12 +57,67 @@ TWIN = {"alternatives": ("motor_inertia",), "alternative_probabilities": (0.4,)}
     [
         ([finding("cogging", 0.9)], "The model lacks cogging (motor): "),
         ([finding("cogging", 0.46, **TWIN)], "Most likely the model lacks cogging (motor) (0.46), else motor inertia (0.40): "),
-        ([finding("cogging", 0.2)], "Something at the motor has no likely name yet (move faster): "),
+        ([finding("cogging", 0.40, **TWIN)], "Most likely the model lacks one of cogging (motor) (0.40), motor inertia (0.40): "),
+        ([finding("cogging", 0.2)], "Something at the motor has no likely name yet (record another motion, faster, slower and wider): "),
+        ([finding("cogging", 0.95), finding("gravity", 0.2, alternatives=("deflection_offset",), alternative_probabilities=(0.2,))],
+         "The model lacks cogging (motor); something at the motor has no likely name yet (gravity or deflection offset: cover"),
         ([finding("cogging", 0.95), finding("motor_inertia", 0.5)], "The model lacks cogging (motor); most likely motor inertia (motor) (0.50): "),
     ],
 )  # fmt: skip
 def test_an_effect_is_said_as_surely_as_it_is_known(effects, said):
-    assert sentence(outcome(*effects, advice=("move faster",))).startswith(said)
+    assert sentence(outcome(*effects, advice=("about another effect",))).startswith(said)
+
+
+def test_each_candidate_has_one_probability_whoever_names_it():
+    def account(*names: str) -> Any:
+        keys = frozenset((name, 0) for name in names)
+        terms = [SimpleNamespace(candidate=SimpleNamespace(key=(name, 0))) for name in names]
+        return SimpleNamespace(keys=keys, named=keys, terms=terms)
+
+    found = account("back_driving_loss", "cogging")
+    beside = [
+        (0.3, found),
+        (0.3, account("back_driving_loss", "gravity")),
+        (0.4, account("gravity", "cogging")),
+    ]
+    chance = chances(found, beside, linked=True)
+    assert chance["gravity", 0] == pytest.approx(0.7)
+    for k, own in enumerate((0.6, 0.7)):
+        stands = standing(found, k, beside, chance, linked=True)
+        assert stands.probability == pytest.approx(own)
+        assert stands.alternatives == (("gravity", chance["gravity", 0]),)
+
+
+def test_what_was_found_stands_among_the_candidates_though_it_was_not_promising_at_first():
+    def alone(name: str, left: float) -> Any:
+        candidate = SimpleNamespace(kind=SimpleNamespace(name=name, location="motor"), motor=0)
+        regression = SimpleNamespace(residual=lambda _: np.full(2, left))
+        return SimpleNamespace(
+            terms=[SimpleNamespace(candidate=candidate)], keys={(name, 0)}, regression=regression,
+            posterior=SimpleNamespace(x=None),
+        )  # fmt: skip
+
+    problem = SimpleNamespace(
+        group=np.zeros(2, int), equations=1, torque_rms=1.0, model=SimpleNamespace(motors=(0,))
+    )
+    singles, found = [alone("coulomb_friction", 0.2)], alone("load_dependent_friction", 0.1)
+    search: Any = SimpleNamespace(problem=problem, singles=lambda: singles, seen=[*singles, found])
+    chance = {("coulomb_friction", 0): 0.4, ("load_dependent_friction", 0): 0.6}
+    rivals = rivals_of(search, [finding("load_dependent_friction", 0.6)], chance)
+    assert [(r.name, r.error_relative, r.probability) for r in rivals] == [
+        ("load_dependent_friction", 0.1, 0.6), ("coulomb_friction", 0.2, 0.4),
+    ]  # fmt: skip
+    made = as_json(
+        replace(outcome(finding("load_dependent_friction", 0.6)), rivals=tuple(rivals)), {}, "a.csv"
+    )
+    assert [one["motor"] for one in (*made["effects"], *made["candidates"])] == [1, 1, 1]
+
+
+def test_advice_says_once_what_separates_several_from_one():
+    said = advice_for("coulomb_friction", ("cogging", "stribeck_friction", "gravity"))
+    assert [line.split(":")[0] for line in said] == [
+        "Coulomb friction or cogging or gravity", "Coulomb friction or Stribeck friction",
+    ]  # fmt: skip
 
 
 def test_a_report_says_once_what_is_alike_and_breaks_no_number_in_40_columns():

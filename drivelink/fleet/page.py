@@ -15,7 +15,8 @@ from matplotlib.ticker import MaxNLocator
 from drivelink.fleet.summary import LOOK, STATES, parameter_name, spaced
 from drivelink.output.document import Block, Document, Grid, Markup, Paragraph, Rows, Section, drawn
 from drivelink.output.document import page as draw
-from drivelink.output.numbers import in_words, number, with_interval
+from drivelink.output.numbers import number, with_interval
+from estimator.effects import in_words
 from estimator.sample import SIGMA_95
 
 _CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large

@@ -13,7 +13,8 @@ from scipy.stats import false_discovery_control
 from drivelink import __version__
 from drivelink.fleet.changes import LEAST, Appearance, appearance, iso, lost, unusable
 from drivelink.fleet.trends import Series, others, parameter, stiffnesses, transmission
-from drivelink.output.numbers import bare_name, in_words, with_interval
+from drivelink.output.numbers import bare_name, with_interval
+from estimator.effects import in_words
 from estimator.sample import SIGMA_95
 from estimator.transmissions import RIGID
 

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from drivelink.files import write_whole
 from drivelink.output import plots
 from drivelink.output.document import Chart, Grid, Paragraph, Rows, Section
-from drivelink.output.numbers import Units, in_words, number
+from drivelink.output.numbers import Units, number
 from estimator.diagnosis.motion import NextMotion
+from estimator.effects import in_words
 from estimator.sample import FloatArray
 
 _COLUMNS = ("position_rad", "velocity_rad_s", "acceleration_rad_s2", "torque_nm")

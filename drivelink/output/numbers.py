@@ -90,11 +90,6 @@ _LINEAR = {  # of a linear axis: metres for rad, newtons for N·m
 }  # fmt: skip
 
 
-def in_words(name: str) -> str:
-    """Return the name of an effect as it stands in a sentence."""
-    return name.replace("_", " ").replace("coulomb", "Coulomb").replace("stribeck", "Stribeck")
-
-
 def bare_name(name: str) -> str:
     """Return the name of a parameter in words, without its unit."""
     ending = next((end for end, _ in _UNITS if f"_{name}".endswith(end)), "")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -29,11 +28,18 @@ from drivelink.output.document import (
     page,
     parameter_rows,
 )
-from drivelink.output.numbers import Units, among, in_words
-from drivelink.output.sentences import SURE, free_curve, others_of, sentence, title_of, unexplained
+from drivelink.output.numbers import Units, among
+from drivelink.output.sentences import (
+    SURE,
+    free_curve,
+    others_of,
+    sentence,
+    title_of,
+    unexplained,
+)
 from estimator.choices import choice
 from estimator.diagnosis import Curve, Diagnosis, Finding, StiffnessCurve
-from estimator.effects import LIBRARY
+from estimator.effects import LIBRARY, in_words
 from estimator.freerun import FreeRun
 from estimator.reasons import percent
 from estimator.sample import SIGMA_95
@@ -42,7 +48,6 @@ _SCHEMA = "drivelink.diagnosis/1"
 _CURVE_POINTS = 200
 _RIVALS = 8
 _COLUMN = 4.6  # inches of a plot in half the page, or on a phone
-_LIBRARY_NAME = re.compile(rf"\b({'|'.join(LIBRARY)})\b")
 _AXES = {
     "position": "motor position / rad",
     "velocity": "motor velocity / (rad/s)",
@@ -93,7 +98,7 @@ def as_json(outcome: Diagnosis, runs: Mapping[str, FreeRun], of: str) -> dict[st
         ],
         "alignment": dict(outcome.alignment),
         "alignment_std": dict(outcome.alignment_std),
-        "candidates": [rival._asdict() for rival in outcome.rivals],
+        "candidates": [_numbered(rival._asdict()) for rival in outcome.rivals],
         "advice": list(outcome.advice),
         "notes": list(outcome.notes),
         "free_run": fits_json(runs, of),
@@ -101,15 +106,18 @@ def as_json(outcome: Diagnosis, runs: Mapping[str, FreeRun], of: str) -> dict[st
 
 
 def _effect(finding: Finding, unlisted: Curve | None) -> dict[str, Any]:
-    entry = asdict(finding)
-    for name, absent in (("motor", None), ("coordinates", ())):
-        if entry[name] == absent:
-            del entry[name]
-    if finding.motor is not None:
-        entry["motor"] = finding.motor + 1
+    entry = _numbered(asdict(finding))
+    if not finding.coordinates:
+        del entry["coordinates"]
     if finding.coordinates and unlisted is not None:
         entry["curve"] = _points(unlisted)
     return entry
+
+
+def _numbered(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return an entry with the number of its motor, not the index; without any at the link."""
+    motor = entry.pop("motor")
+    return entry if motor is None else {**entry, "motor": motor + 1}
 
 
 def _points(curve: Curve) -> dict[str, list[float]]:
@@ -195,25 +203,24 @@ def _candidates(outcome: Diagnosis) -> list[Block]:
     """Each promising effect alone, and why the chosen ones were chosen."""
     if not outcome.rivals:
         return []
-    chances = {(f.name, f.motor): f.probability for f in outcome.effects}
-    others = {n: p for f in outcome.effects
-              for n, p in zip(f.alternatives, f.alternative_probabilities, strict=True)}  # fmt: skip
-    shown = [r for k, r in enumerate(outcome.rivals) if k < _RIVALS or (r.name, r.motor) in chances]
+    found = {(f.name, f.motor): f.probability for f in outcome.effects}
+    shown = [r for k, r in enumerate(outcome.rivals) if k < _RIVALS or (r.name, r.motor) in found]
     most = max(rival.error_relative for rival in shown)
     rows: Rows = []
     several = len(outcome.transmissions) > 1
     for rival in shown:
-        mine = chances.get((rival.name, rival.motor))
-        p = others.get(rival.name) if mine is None else mine
+        mine = found.get((rival.name, rival.motor))
+        p = rival.probability if mine is None else mine
         motor = f", motor {rival.motor + 1}" if rival.motor is not None and several else ""
         named = f"{'' if mine is None else '▶ '}{in_words(rival.name)}{motor}"
-        chance = (f"< {choice('even'):g}" if p is None else f"{p:.2f}",) if chances else ()
+        even = choice("even")
+        chance = (f"< {even:g}" if mine is None and p <= even else f"{p:.2f}",) if found else ()
         left = Share(percent(rival.error_relative, 2), rival.error_relative / most)
         rows.append((named, *chance, left))
-    head = ("candidate", *(("probability",) if chances else ()), "error left with it alone")
+    head = ("candidate", *(("probability",) if found else ()), "error left with it alone")
     return [
         Grid(head, _together(rows)),
-        Paragraph(_choice_of(outcome, [r.error_relative for r in shown if (r.name, r.motor) in chances])),
+        Paragraph(_choice_of(outcome, [r.error_relative for r in shown if (r.name, r.motor) in found])),
     ]
 
 
@@ -328,7 +335,7 @@ def _doubts(outcome: Diagnosis) -> list[Block]:
         for f in outcome.effects
         if f.alternatives
     ]
-    lines += [_LIBRARY_NAME.sub(lambda name: in_words(name[0]), line) for line in outcome.advice]
+    lines += outcome.advice
     if outcome.verdict == "insufficient_excitation" or any(f.alternatives for f in outcome.effects):
         lines.append("drivelink diagnose --motion next.csv designs a motion that tells them apart")
     if outcome.effects and not lines:

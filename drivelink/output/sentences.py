@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from drivelink.output.numbers import Units, in_words, number
-from estimator.diagnosis import Curve, Diagnosis, Finding
+from drivelink.output.numbers import Units, number
+from estimator.diagnosis import Curve, Diagnosis, Finding, advice_for
+from estimator.effects import in_words
 from estimator.reasons import percent
 
 # probabilities at which an effect is missing, and at which it has a name
@@ -43,22 +44,29 @@ def sentence(outcome: Diagnosis) -> str:
 def lacks(outcome: Diagnosis) -> str:
     """Return what is missing, said as surely as it is known."""
     sure = [title_of(f, outcome) for f in outcome.effects if f.probability >= SURE]
-    likely = [
-        f"{title_of(f, outcome)} ({f.probability:.2f})" + (f", else {others_of(f)}" if f.alternatives else "")
-        for f in outcome.effects
-        if _LIKELY <= f.probability < SURE
-    ]
-    unsure = sorted({_place(f, outcome) for f in outcome.effects if f.probability < _LIKELY})
+    likely = [_likely(f, outcome) for f in outcome.effects if _LIKELY <= f.probability < SURE]
+    nameless = [f for f in outcome.effects if f.probability < _LIKELY]
+    unsure = sorted({_place(f, outcome) for f in nameless})
     said = []
     if sure:
         said.append(f"The model lacks {' and '.join(sure)}")
     if likely:
         said.append(f"most likely {'' if sure else 'the model lacks '}{' and '.join(likely)}")
     if unsure:
-        to_do = outcome.advice[0] if outcome.advice else "record another motion, faster, slower and wider"
+        about = (line for f in nameless for line in advice_for(f.name, f.alternatives))
+        to_do = next(about, "record another motion, faster, slower and wider")
         said.append(f"something at the {' and '.join(unsure)} has no likely name yet ({to_do})")
     text = "; ".join(said)
     return text[0].upper() + text[1:]
+
+
+def _likely(finding: Finding, outcome: Diagnosis) -> str:
+    """Return a likely effect and what else it may be; one of several, where another is no less likely."""
+    own = f"{title_of(finding, outcome)} ({finding.probability:.2f})"
+    if not finding.alternatives:
+        return own
+    behind = round(max(finding.alternative_probabilities), 2) < round(finding.probability, 2)
+    return f"{own}, else {others_of(finding)}" if behind else f"one of {own}, {others_of(finding)}"
 
 
 def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:

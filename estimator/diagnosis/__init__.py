@@ -1,5 +1,6 @@
 """Traces a residual to a physical effect: locate, select, judge."""
 
+from estimator.diagnosis.excitation import advice_for
 from estimator.diagnosis.result import (
     Curve,
     Diagnosis,
@@ -25,5 +26,6 @@ __all__ = [
     "Series",
     "StiffnessCurve",
     "Verdict",
+    "advice_for",
     "diagnose",
 ]

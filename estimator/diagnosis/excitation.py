@@ -7,6 +7,7 @@ from scipy import fft
 
 from estimator.choices import choice
 from estimator.diagnosis.frame import Frame
+from estimator.effects import in_words
 from estimator.sample import FloatArray
 
 __all__ = ["advice_for", "lines", "poor"]
@@ -29,51 +30,36 @@ def poor(frame: Frame) -> bool:
     )
 
 
+_ANOTHER = "repeat with another motion: faster and slower, wider, a sum of several frequencies instead of one"
 _HINTS = {
-    frozenset({"torque_offset", "deflection_offset"}): (
-        "torque_offset or deflection_offset: only the link's dynamics ([link.dynamics]) or a known zero of "
-        "the encoders separates them"
-    ),
-    frozenset({"cogging", "kinematic_error"}): (
-        "cogging or kinematic_error: declare [link.dynamics]; a kinematic error shows on both sides"
-    ),
-    frozenset({"viscous_damping", "encoder_delay"}): (
-        "viscous_damping or encoder_delay: move faster, so that the deflection changes with acceleration, or "
-        "declare [link.dynamics]"
-    ),
-    frozenset({"transmission_damping", "deflection_delay"}): (
-        "transmission_damping or deflection_delay: move faster, or declare [link.dynamics]; damping acts on "
-        "the link, a late sensor does not"
-    ),
-    frozenset({"encoder_scale", "motor_inertia"}): (
-        "encoder_scale or motor_inertia: hold different positions under load at standstill"
-    ),
-    frozenset({"coulomb_friction", "stribeck_friction"}): (
-        "coulomb_friction or stribeck_friction: move slowly, at constant velocities near zero"
-    ),
-    frozenset({"coulomb_friction", "asymmetric_friction"}): (
-        "coulomb_friction or asymmetric_friction: move at the same speeds in both directions"
-    ),
-    frozenset({"coulomb_friction", "presliding_friction"}): (
-        "coulomb_friction or presliding_friction: reverse often, over very small distances"
-    ),
-    frozenset({"gravity", "deflection_offset"}): (
-        "gravity or deflection_offset: cover a larger arc of the link, at least a quarter turn"
-    ),
-    frozenset({"encoder_eccentricity", "encoder_scale"}): (
-        "encoder_eccentricity or encoder_scale: cover a larger arc of the link, best a full turn"
-    ),
-}
+    frozenset(pair): hint
+    for *pair, hint in (
+        (
+            "torque_offset", "deflection_offset",
+            "only the link's dynamics ([link.dynamics]) or a known zero of the encoders separates them",
+        ),
+        ("cogging", "kinematic_error", "declare [link.dynamics]; a kinematic error shows on both sides"),
+        (
+            "viscous_damping", "encoder_delay",
+            "move faster, so that the deflection changes with acceleration, or declare [link.dynamics]",
+        ),
+        (
+            "transmission_damping", "deflection_delay",
+            "move faster, or declare [link.dynamics]; damping acts on the link, a late sensor does not",
+        ),
+        ("encoder_scale", "motor_inertia", "hold different positions under load at standstill"),
+        ("coulomb_friction", "stribeck_friction", "move slowly, at constant velocities near zero"),
+        ("coulomb_friction", "asymmetric_friction", "move at the same speeds in both directions"),
+        ("coulomb_friction", "presliding_friction", "reverse often, over very small distances"),
+        ("gravity", "deflection_offset", "cover a larger arc of the link, at least a quarter turn"),
+        ("encoder_eccentricity", "encoder_scale", "cover a larger arc of the link, best a full turn"),
+    )
+}  # fmt: skip
 
 
 def advice_for(name: str, alternatives: tuple[str, ...]) -> list[str]:
     """Return advice: the motion or knowledge that would separate an effect from its alternatives."""
-    said = []
+    others: dict[str, list[str]] = {}
     for other in alternatives:
-        hint = _HINTS.get(frozenset({name, other}))
-        said.append(
-            hint
-            or f"{name} or {other}: repeat with another motion: faster and slower, wider, a sum of several "
-            "frequencies instead of one"
-        )
-    return said
+        others.setdefault(_HINTS.get(frozenset({name, other}), _ANOTHER), []).append(in_words(other))
+    return [f"{in_words(name)} or {' or '.join(names)}: {hint}" for hint, names in others.items()]

@@ -13,7 +13,7 @@ from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.design_matrix import curve_columns
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.joint_priors import longest_delay_s
-from estimator.diagnosis.probabilities import Standing, accounts
+from estimator.diagnosis.probabilities import Chances, Standing, accounts
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Curve, Finding, Refitted, Rival, Series
 from estimator.diagnosis.search import Search
@@ -260,16 +260,29 @@ def _between(
     return total
 
 
-def rivals_of(search: Search) -> list[Rival]:
-    """Return the relative error with each promising effect alone, best first."""
-    standing = []
-    for found in search.singles():
-        candidate = found.terms[-1].candidate
-        left = found.regression.residual(found.posterior.x)
-        motors = search.problem.group % search.problem.equations < len(search.problem.model.motors)
+def rivals_of(search: Search, effects: Sequence[Finding], chance: Chances) -> list[Rival]:
+    """Return the relative error with each promising effect alone, and each that was found, best first."""
+    alone = {
+        (one.terms[-1].candidate.kind.name, one.terms[-1].candidate.motor): one for one in search.singles()
+    }
+    for finding in effects:
+        if (key := (finding.name, finding.motor)) not in alone:
+            fitted = next((one for one in search.seen if one.keys == {key}), None)
+            if (fitted := fitted or search.with_effect(search.null, *key)) is not None:
+                alone[key] = fitted
+    # A late reading is no term: what may be in its place is known to its finding only.
+    late = {
+        name: p for f in effects if (f.name, f.motor) not in chance
+        for name, p in zip(f.alternatives, f.alternative_probabilities, strict=True)
+    }  # fmt: skip
+    motors = search.problem.group % search.problem.equations < len(search.problem.model.motors)
+    made = []
+    for (name, motor), one in alone.items():
+        left = one.regression.residual(one.posterior.x)
         error = float(np.sqrt(np.mean(left[motors] ** 2))) / search.problem.torque_rms
-        standing.append(Rival(candidate.kind.name, candidate.kind.location, candidate.motor, error))
-    return sorted(standing, key=lambda rival: rival.error_relative)
+        p = max(chance.get((name, motor), 0.0), late.get(name, 0.0))
+        made.append(Rival(name, one.terms[-1].candidate.kind.location, motor, error, p))
+    return sorted(made, key=lambda rival: rival.error_relative)
 
 
 def curves_of(problem: Problem, after: Fitted) -> tuple[Curve, ...]:

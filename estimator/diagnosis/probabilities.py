@@ -12,7 +12,10 @@ from estimator.diagnosis.candidates import AGAIN
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Fitted, Keys
 
-__all__ = ["Standing", "accounts", "believed", "standing"]
+__all__ = ["Chances", "Standing", "accounts", "believed", "chances", "standing"]
+
+Key = tuple[str, int | None]
+Chances = dict[Key, float]  # one figure for each effect, whoever names it
 
 
 class Standing(NamedTuple):
@@ -53,23 +56,46 @@ def _twins(key: tuple[str, int | None], beside: Keys, linked: bool) -> list[str]
     return ["torque_offset"] if name == "asymmetric_friction" else []
 
 
-def standing(found: Fitted, k: int, beside: Sequence[tuple[float, Fitted]], linked: bool) -> Standing:
-    """Return the probability and alternatives of the k-th effect found.
+def chances(found: Fitted, beside: Sequence[tuple[float, Fitted]], linked: bool) -> Chances:
+    """Return the probability of each effect that any account has.
+
+    Args:
+        found: the hypothesis.
+        beside: all accounts.
+        linked: whether there are two balances.
+    """
+    made: dict[Key, float] = {}
+    for weight, one in beside:
+        for key in one.keys | (one.named & found.keys):
+            made[key] = made.get(key, 0.0) + weight
+    shared: dict[Key, float] = {}
+    for name, motor in found.keys:
+        for twin in _twins((name, motor), found.keys, linked):
+            made[name, motor] /= 2.0
+            shared[twin, motor] = max(shared.get((twin, motor), 0.0), made[name, motor])
+    return made | {key: made.get(key, 0.0) + p for key, p in shared.items()}
+
+
+def standing(
+    found: Fitted, k: int, beside: Sequence[tuple[float, Fitted]], chance: Chances, linked: bool
+) -> Standing:
+    """Return the probability and alternatives of the k-th effect found: what accounts have in its place.
 
     Args:
         found: the hypothesis. k: which of its effects.
-        beside: all accounts.
+        beside: all accounts. chance: what `chances` says of them.
         linked: whether there are two balances.
     """
     key = found.terms[k].candidate.key
     own = {name.rstrip(AGAIN) for name, _ in found.keys}
-    probability = sum(weight for weight, one in beside if key in one.named)
-    others: dict[str, float] = {}
+    instead = dict.fromkeys(_twins(key, found.keys, linked), chance[key])
     for weight, one in beside:
         if key not in one.named:
             for name in {name.rstrip(AGAIN) for name, _ in one.keys} - own:
-                others[name] = others.get(name, 0.0) + weight
-    for twin in _twins(key, found.keys, linked):
-        probability, others[twin] = probability / 2.0, others.get(twin, 0.0) + probability / 2.0
-    listed = sorted(((n, p) for n, p in others.items() if p > choice("even")), key=lambda pair: -pair[1])
-    return Standing(probability, tuple(listed))
+                instead[name] = instead.get(name, 0.0) + weight
+    listed = [
+        (name, max(p for (other, _), p in chance.items() if other.rstrip(AGAIN) == name))
+        for name, weight in instead.items()
+        if weight > choice("even")
+    ]
+    return Standing(chance[key], tuple(sorted(listed, key=lambda pair: -pair[1])))

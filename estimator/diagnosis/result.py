@@ -44,8 +44,8 @@ class Finding:
         parameters: by their names in the joint file.
         std: their standard deviations, if known.
         probability: of this effect against its alternatives.
-        alternatives: other possible effects, the most probable first.
-        alternative_probabilities: their probabilities.
+        alternatives: what may be in its place, the most probable first.
+        alternative_probabilities: their probabilities, those of the candidates.
         share: fraction of the declared model's squared error that it explains in addition to the others.
         coordinates: of the curve of an unlisted effect.
     """
@@ -63,12 +63,13 @@ class Finding:
 
 
 class Rival(NamedTuple):
-    """A candidate with the relative error of a model with it alone."""
+    """A candidate with the relative error of a model with it alone, and its probability."""
 
     name: str
     location: str
     motor: int | None
     error_relative: float
+    probability: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -20,7 +20,7 @@ from estimator.diagnosis.findings import (
 )
 from estimator.diagnosis.heldout import errors_of, wider
 from estimator.diagnosis.hypothesis import Fitted
-from estimator.diagnosis.probabilities import accounts, believed, standing
+from estimator.diagnosis.probabilities import Chances, accounts, believed, chances, standing
 from estimator.diagnosis.result import Diagnosis, Errors, Finding, RecordingErrors, Refitted, Verdict
 from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.stiffness import stiffness_curves
@@ -72,9 +72,11 @@ class Judge:
         seen = [*self.search.seen, *([] if curve is None else [curve])]
         beside = accounts(self.held, self.found, seen)
         linked = self.problem.frames[0].linked
-        standings = [standing(self.found, k, beside, linked) for k in range(len(self.found.terms))]
+        chance = chances(self.found, beside, linked)
+        terms = range(len(self.found.terms))
+        standings = [standing(self.found, k, beside, chance, linked) for k in terms]
         effects = findings_of(self.search, self.found, standings, self.surplus)
-        return self._stated(self._judged(effects, curve), beside)
+        return self._stated(self._judged(effects, curve), beside, chance)
 
     def _judged(self, effects: list[Finding], curve: Fitted | None) -> _Judged:
         """The verdict, with the declared model kept where what explains it is worse on held-out data."""
@@ -139,7 +141,7 @@ class Judge:
             return "insufficient_excitation", [hidden]
         return verdict, []
 
-    def _stated(self, judged: _Judged, beside: list[tuple[float, Fitted]]) -> Diagnosis:
+    def _stated(self, judged: _Judged, beside: list[tuple[float, Fitted]], chance: Chances) -> Diagnosis:
         """What is reported of a verdict."""
         problem, surplus = self.problem, self.surplus
         effects, before, after = judged.effects, judged.before, judged.after
@@ -160,7 +162,7 @@ class Judge:
             transmissions=transmissions,
             alignment={name: value for name, (value, _) in aligned.items()},
             alignment_std={name: std for name, (_, std) in aligned.items()},
-            rivals=tuple(rivals_of(self.search)),
+            rivals=tuple(rivals_of(self.search, effects, chance)),
             curves=curves_of(problem, after),
             series=series_of(problem, before, after),
             advice=tuple(dict.fromkeys(line for f in effects for line in advice_for(f.name, f.alternatives))),

@@ -6,6 +6,7 @@ import codecs
 import difflib
 import logging
 import os
+import re
 import shutil
 import sys
 import textwrap
@@ -31,6 +32,12 @@ def expected(name: str, known: Collection[str]) -> str:
     """Return what was expected instead of an unknown name: the nearest, or one of all."""
     close = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
+
+
+def natural(name: str) -> list[str | tuple[int, str]]:
+    """Return the key that sorts names as people do: elbow-2 before elbow-10."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(len(digits := part.lstrip("0")), digits) if k % 2 else part for k, part in enumerate(parts)]
 
 
 def _shown(character: str) -> str:

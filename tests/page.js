@@ -1,7 +1,9 @@
 // The live view's page without a browser: stand-ins for what its script asks of one. A test appends the page's
 // script and what it does with it (tests/test_web_page.py).
 "use strict";
-const brush = new Proxy({}, { get: () => () => {}, set: () => true }); // a canvas's context: draws nothing
+const written = [];
+const write = text => { written.push(text); };
+const brush = new Proxy({}, { get: (_, name) => (name === "fillText" ? write : () => {}), set: () => true }); // draws nothing
 const elements = {}, listeners = {};
 function element() {
   return {

@@ -233,6 +233,9 @@ def test_accepting_writes_the_file_keeps_the_old_one_and_can_be_undone(friction,
         later, {"schema": finding.SCHEMA, "state": finding.DIAGNOSING, "sentence": "being looked for"}
     )
     offer = acceptance.proposal(path)  # what is still being diagnosed takes its place when it is done
+    assert finding.foremost(later.parent, "demo-elbow") == offer.finding  # in the views, too
+    finding.write(later, {**offer.finding, "state": finding.NOTHING})
+    assert finding.foremost(later.parent, "demo-elbow")["state"] == finding.NOTHING
     later.unlink()
     old = acceptance.accept(offer)
     assert old.read_text() == ELBOW.read_text() and old.name.startswith("elbow-2")

@@ -26,6 +26,7 @@ from drivelink.monitor.terminal import can_draw, joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.web import snapshot
 from drivelink.output.numbers import number, with_interval
+from drivelink.plaintext import natural
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
@@ -347,6 +348,15 @@ def test_several_joints_are_one_line_each_and_no_column_is_cut_off():
         shown = lines(joints_table({"elbow": filled(), "wrist": gone, "far": far}, width), width)
         assert len(shown) == 4 and "daemon gone" in "".join(shown)
         assert all(len(line) <= width and "…" not in line for line in shown), shown
+
+
+def test_nodes_and_joints_are_in_natural_order():
+    names = ["10", "2", "1"]
+    said = [f"node {name}: frames are missing" for name in names]
+    shown = shape({"nodes": {name: {} for name in names}, "conditions": said})
+    assert [node.id for node in shown.nodes] == ["1", "2", "10"]
+    assert shown.wrong == ("nodes 1, 2, 10: frames are missing",)
+    assert sorted(["b-10", "b-2", "2", "b-02b", "b"], key=natural) == ["2", "b", "b-2", "b-02b", "b-10"]
 
 
 def test_without_a_bus_no_node_is_operational_and_what_several_nodes_lack_is_said_once():

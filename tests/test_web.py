@@ -21,6 +21,9 @@ const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
 let n = 0; for (let i = 0; i < d.length; i += 4) if (d[i + 3] > 200 && d[i + 2] - d[i] > 80) n++;
 return n > 100 ? n : 0; })()"""
 WIDE = "[...document.querySelectorAll('.numbers dl')].filter(d => d.scrollWidth > d.clientWidth).length"
+LONG = """(() => { $('externalbox').hidden = false; $('external').textContent = 'not valid';
+$('externalband').textContent = 'the residual is above the model\'s own baseline: the model is not sufficient';
+return document.documentElement.scrollWidth; })()"""
 SAVE = "HTMLAnchorElement.prototype.click = function() { saved = this.href; }; $('save').click()"
 
 
@@ -150,6 +153,7 @@ def test_the_page_draws_live_plots_in_a_browser(web, tmp_path):
         for width in (390, 800, 1200):  # no number reaches into the next one
             browser.resize(width, 900)
             assert browser.evaluate(WIDE) == 0
+            assert browser.evaluate(LONG) <= width  # nor does a reason widen the page
             assert (
                 browser.evaluate("new Set(['measured', 'save', 'pause'].map(id => $(id).offsetTop)).size")
                 == 1

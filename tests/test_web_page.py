@@ -72,6 +72,15 @@ def test_the_page_shows_numbers_flags_gauge_and_nodes_and_that_the_monitor_has_e
     assert flags == "no connection" and link.startswith("drivelink monitor has ended")
 
 
+@pytest.mark.parametrize(
+    ("alarm", "ratio", "style"), [(True, 2.0, "over"), (False, 2.0, "above"), (False, 1.0, "bar")]
+)
+def test_a_residual_above_its_baseline_is_not_green(alarm, ratio, style):
+    one = json.dumps({"balances": [["motor", 0.1, 0.05, ratio]], "alarm": alarm})
+    bars = page(f"gauges({one}); return $('gauges').children.map(row => row.children[1].className);")
+    assert bars[0].split()[-1] == style
+
+
 def test_an_error_that_does_not_fall_has_no_two_bars_of_one_length():
     assert page(
         """
@@ -130,14 +139,16 @@ def test_what_is_not_valid_is_shown_grey_with_the_reason_and_sets_no_scale():
     view, one = fed(), (TransmissionEstimate(500.0, 900.0, 1.0, 0.01),)
     for k in range(4000, 6000):
         view.update(Estimate(k, int(Status.OBSERVABLE), 500.0, 900.0, 1.0, one), 1e-3 * k)
-    low, high, height, tip, title, style = page(
+    low, high, height, tip, title, style, key = page(
         SPAN
         + """
         hover("torqueplot", X(-1), Y(500));
-        return [Y(-2), Y(2), B - T, $("tip").textContent, document.title, $("stiffness").className];
+        return [Y(-2), Y(2), B - T, $("tip").textContent, document.title, $("stiffness").className,
+                written.includes("not valid")];
         """,
         view,
     )
+    assert key and not page("take(sent[0]); return written.includes('not valid');", fed())  # what grey means
     assert low - high > 0.5 * height and tip.endswith("500.0 N·m\nnot valid")
     assert (title, style) == ("not valid · elbow · drivelink", "past")
 

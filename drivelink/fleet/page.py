@@ -16,6 +16,7 @@ from drivelink.fleet.summary import LOOK, STATES, parameter_name, spaced
 from drivelink.output.document import Block, Document, Grid, Markup, Paragraph, Rows, Section, drawn
 from drivelink.output.document import page as draw
 from drivelink.output.numbers import number, with_interval
+from drivelink.plaintext import natural
 from estimator.effects import in_words
 from estimator.sample import SIGMA_95
 
@@ -84,7 +85,7 @@ def _headline(joints: Sequence[dict[str, Any]]) -> str:
 
 def _orders(joints: Sequence[dict[str, Any]]) -> list[str]:
     """Style of each joint with its place by each way of sorting."""
-    names = sorted(joint["joint"] for joint in joints)
+    names = sorted((joint["joint"] for joint in joints), key=natural)
     lasts = sorted({joint["last"] or "" for joint in joints}, reverse=True)
     return [
         f"--by0:{k};--by1:{names.index(joint['joint'])};--by2:{lasts.index(joint['last'] or '')}"

@@ -14,6 +14,7 @@ from drivelink import __version__
 from drivelink.fleet.changes import LEAST, Appearance, appearance, iso, lost, unusable
 from drivelink.fleet.trends import Series, others, parameter, stiffnesses, transmission
 from drivelink.output.numbers import bare_name, with_interval
+from drivelink.plaintext import natural
 from estimator.effects import in_words
 from estimator.sample import SIGMA_95
 from estimator.transmissions import RIGID
@@ -81,7 +82,7 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
         })
         for name, one in joints.items()
     ]  # fmt: skip
-    documents.sort(key=lambda d: (-d["urgency"], d["joint"]))
+    documents.sort(key=lambda d: (-d["urgency"], natural(d["joint"])))
     times = [row["time"] for row in rows if row["time"] is not None]
     broken = [row for row in rows if row["status"] != "done"]
     return {

@@ -81,5 +81,4 @@ class FindingFeed(_Feed):
         return self._seen != before
 
     def _work(self) -> None:
-        newest = finding.newest(self._folder, self._joint)
-        self._found = newest[1] if newest is not None else {}
+        self._found = finding.foremost(self._folder, self._joint)

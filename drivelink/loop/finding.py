@@ -215,6 +215,16 @@ def newest(folder: Path, joint: str, *, finished: bool = False) -> tuple[Path, d
     return None
 
 
+def foremost(folder: Path, joint: str) -> dict[str, Any]:
+    """Return the finding that a view shows; empty without one.
+
+    A proposal stands until the next diagnosis is over: what a person may accept does not vanish meanwhile.
+    """
+    over = newest(folder, joint, finished=True)
+    shown = over if over is not None and over[1]["state"] == PROPOSED else newest(folder, joint)
+    return {} if shown is None else shown[1]
+
+
 def event_s(finding: Mapping[str, Any]) -> float | None:
     """Return the UNIX time of a finding's event, s; None: it says none."""
     try:

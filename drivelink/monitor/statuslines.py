@@ -17,7 +17,7 @@ from rich.text import Text
 from drivelink.loop import finding as findings
 from drivelink.monitor.braille import gauge
 from drivelink.output.numbers import number
-from drivelink.plaintext import clean_text
+from drivelink.plaintext import clean_text, natural
 
 MODEL_ALARM_ADVICE = (
     "the model is not sufficient: do not control on its numbers; record a minute of motion "
@@ -102,6 +102,7 @@ def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> 
     alarm = _part(status, "residual_alarm")
     transmissions = status.get("transmissions")
     motors = min(len(transmissions), 2) if isinstance(transmissions, list) else 1
+    nodes = _part(status, "nodes")
     times = [(name, _number(_part(status, key).get("p99_us"))) for key, name in _TIMES]
     wrong = dict.fromkeys((*_texts(status.get("drive_faults")), *_texts(status.get("conditions"))))
     rate, cpu, load = (_number(v) for v in (status.get("rate_hz"), status.get("cpu_fraction"),
@@ -116,8 +117,8 @@ def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> 
         load=f"{100 * load:.0f} %" if load is not None else "",
         times=tuple((name, p99) for name, p99 in times if p99 is not None),
         nodes=tuple(
-            _node(*entry, heard=status.get("state") != "bus lost")
-            for entry in islice(_part(status, "nodes").items(), _MOST)
+            _node(name, nodes[name], heard=status.get("state") != "bus lost")
+            for name in sorted(islice(nodes, _MOST), key=natural)
         ),
         wrong=_together(wrong),
         not_valid=_text(status.get("not_valid")),
@@ -163,7 +164,7 @@ def _together(remarks: Iterable[str]) -> tuple[str, ...]:
         nodes.setdefault(said if whose.isdecimal() else remark, []).append(whose)
     return tuple(
         f"node{'s' * (len(whose) > 1)} {', '.join(whose)}: {said}" if whose[0].isdecimal() else said
-        for said, whose in nodes.items()
+        for said, whose in ((said, sorted(each, key=natural)) for said, each in nodes.items())
     )
 
 

@@ -33,7 +33,7 @@ def joints_table(views: Mapping[str, JointView], width: int) -> Table:
     if sparks >= 8:
         table.add_column("last seconds", no_wrap=True, min_width=sparks)
     table.add_column("state", ratio=1, overflow="fold", min_width=12)
-    for name, view in sorted(views.items()):
+    for name, view in views.items():
         estimate = view.history.latest
         ink = ESTIMATE if view.live else "dim"
         cells = [Text(name, style="bold")]

@@ -14,7 +14,7 @@ import zenoh
 
 from drivelink.errors import ZenohError
 from drivelink.monitor.view import JointView
-from drivelink.plaintext import clean_text
+from drivelink.plaintext import clean_text, natural
 from drivelink.pubsub.clientbase import PATIENCE_S, absent, ask
 from drivelink.pubsub.feed import DECODERS, DOCUMENTS, MAX_CLAIMS, DaemonIdentity, follow_document, source_of
 
@@ -77,8 +77,9 @@ class Watcher:
 
     @property
     def views(self) -> dict[str, JointView]:
-        """Views by joint name."""
-        return {joint.view.name: joint.view for joint in self._joints.values()}
+        """Views by joint name, elbow-2 before elbow-10."""
+        named = {joint.view.name: joint.view for joint in self._joints.values()}
+        return {name: named[name] for name in sorted(named, key=natural)}
 
     @property
     def alive(self) -> set[str]:

@@ -130,7 +130,7 @@ class WebView:
         with self._lock:
             joints = {
                 name: snapshot(view, name in self._watcher.alive, since)
-                for name, view in sorted(self._watcher.views.items())
+                for name, view in self._watcher.views.items()
             }
             acceptance = self.acceptance
             if acceptance is not None and acceptance.joint in joints:

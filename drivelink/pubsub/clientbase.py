@@ -21,7 +21,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from drivelink.errors import ZenohError
-from drivelink.plaintext import clean_text
+from drivelink.plaintext import clean_text, natural
 from drivelink.pubsub.feed import DECODERS, DOCUMENTS, WAKE, Feed, State, follow_document, source_of
 from drivelink.pubsub.session import ENDPOINT, close_session, connected, one_line, open_client
 from drivelink.pubsub.wire import ESTIMATE, EstimateMessage, ExternalMessage
@@ -52,7 +52,7 @@ def joints(
         names: set[str] = set()
         for reply in session.liveliness().get(f"{prefix}/*/alive/**", timeout=_ANSWER_S):
             _enter(names, reply, prefix)
-        return sorted(names)
+        return sorted(names, key=natural)
     finally:
         close_session(session)
 
@@ -61,7 +61,9 @@ def ask(session: zenoh.Session, prefix: str, answer: Callable[[list[str]], None]
     """Call `answer` in zenoh's thread with the names; never waits."""
     names: set[str] = set()
     handler: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(
-        lambda reply: _enter(names, reply, prefix), drop=lambda: answer(sorted(names)), indirect=False
+        lambda reply: _enter(names, reply, prefix),
+        drop=lambda: answer(sorted(names, key=natural)),
+        indirect=False,
     )
     with suppress(zenoh.ZError):
         session.liveliness().get(f"{prefix}/*/alive/**", handler, timeout=_ANSWER_S)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import re
 import shutil
@@ -17,12 +18,14 @@ from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import fleetkit
+import psutil
 import pytest
 
 pytest.importorskip("distributed", reason="the extra [fleet] is not installed")
 
+from drivelink import jointfile
 from drivelink.cli import main
-from drivelink.fleet import runner, storage
+from drivelink.fleet import runner, storage, task
 from drivelink.fleet.joints import Joints
 from drivelink.fleet.storage import Store
 from drivelink.fleet.table import read_rows
@@ -137,6 +140,37 @@ def test_ctrl_c_leaves_what_is_finished(fleet, tmp_path):
     assert process.returncode == 130
     assert "Traceback" not in error
     assert 1 <= len(read_rows(Store(str(out)))) < 6
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_the_workers_start_is_one_line(fleet, tmp_path):
+    command = [sys.executable, "-m", "drivelink", "fleet", str(fleet / "recordings")]
+    command += ["--joints", str(fleet / "joints"), "--out", str(tmp_path / "out")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    end = time.monotonic() + 60
+    while time.monotonic() < end and len(psutil.Process(process.pid).children()) < 2:  # beside the tracker
+        time.sleep(0.01)
+    time.sleep(0.3)  # it imports what it needs
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert error.splitlines()[-1].startswith("interrupted") and "Traceback" not in error, error
+
+
+def test_a_worker_does_not_repeat_what_is_said_of_an_edited_joint_file(fleet, caplog, monkeypatch):
+    text = (fleet / "joints" / "elbow.toml").read_text()
+    edited = f"# drivelink wrote this file, and ends it with a check line\n{text}\n# drivelink check: sha256 {0:016x}\n"
+    monkeypatch.setattr(task.signal, "signal", lambda *_: None)
+    jointfile.parse(edited, "elbow.toml")
+    assert "edited since drivelink wrote it" in caplog.text
+    caplog.clear()
+    log = logging.getLogger("drivelink.jointfile")
+    try:
+        task.dask_setup(None)
+        jointfile.parse(edited, "elbow.toml")
+    finally:
+        log.setLevel(logging.NOTSET)
+    assert not caplog.text
 
 
 def test_a_ctrl_c_that_a_finaliser_discards_ends_the_run_all_the_same():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import math
 import os
@@ -13,14 +14,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import islice, pairwise
+from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any, Literal
 
 import dask
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster, as_completed
+from distributed.deploy.spec import close_clusters
 from distributed.scheduler import KilledWorker
 from distributed.security import Security
+from distributed.utils import LoopRunner
 
 from drivelink import __version__
 from drivelink.fleet.joints import Joints, carried_joint
@@ -230,7 +234,7 @@ def _local(settings: Settings, tasks: int) -> Iterator[Client]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
     with (
         tempfile.TemporaryDirectory(prefix="drivelink-dask-") as folder,
-        LocalCluster(
+        _started(
             n_workers=min(settings.workers or cores, tasks),
             threads_per_worker=1,
             processes=True,
@@ -245,6 +249,26 @@ def _local(settings: Settings, tasks: int) -> Iterator[Client]:
         Client(cluster, set_as_default=False) as client,
     ):
         yield client
+
+
+def _started(**how: Any) -> LocalCluster:
+    """Return a cluster whose processes Ctrl-C in the terminal does not reach: this one ends them.
+
+    Raises:
+        KeyboardInterrupt: before all have started; they end with this process.
+    """
+    loop = LoopRunner()
+    resource_tracker.ensure_running()  # else the first process lifts the mask to start it
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        loop.start()  # its thread, and what that starts, inherit the mask
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    try:
+        return LocalCluster(loop=loop.loop, **how)
+    except KeyboardInterrupt:
+        atexit.unregister(close_clusters)  # it refuses those that have not started, with a traceback
+        raise
 
 
 def _remote(address: str, insecure: bool) -> Client:

@@ -46,8 +46,9 @@ _USED = 0.7  # share of the limit that is used: Dask pauses a worker at 0.8 and 
 
 
 def dask_setup(worker: object) -> None:
-    """Leave a terminal's Ctrl-C to the client, which ends local workers in order; Dask calls it in them."""
+    """Leave Ctrl-C, and what the joint files are warned of, to the client; Dask calls it in its workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.getLogger("drivelink.jointfile").setLevel(logging.ERROR)
 
 
 class Piece(NamedTuple):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from rich.text import Text
 
 from drivelink.monitor.history import usual_range
-from drivelink.output.numbers import axis_labels
+from drivelink.output.numbers import axis_ticks
 
 _BARS = "▁▂▃▄▅▆▇█"
 # Bit of the dot at column c (0, 1) and row r (0 on top) of a braille character.
@@ -55,9 +55,10 @@ class DotPlot:
     def __init__(self, width: int, height: int, x: tuple[float, float], y: tuple[float, float]) -> None:
         self._x, self._y = _opened(*x), _opened(*y)
         self.rows = max(2, height - 2)
-        parts = 1 if self.rows < 8 else 2 if self.rows < 13 else 4
-        places = [round(k * (self.rows - 1) / parts) for k in range(parts + 1)]
-        self._labels = dict(zip(places, _ticks(self._y[1], self._y[0], parts), strict=True))
+        low, high = self._y
+        self._labels = {
+            round((high - y) / (high - low) * (self.rows - 1)): label for y, label in axis_ticks(low, high)
+        }
         self._margin = max(6, *map(len, self._labels.values()))
         self.columns = max(4, width - self._margin - 1)
         self._cells = [[0] * self.columns for _ in range(self.rows)]
@@ -106,7 +107,9 @@ class DotPlot:
     def render(self, title: str, x_unit: str = "") -> Text:
         """Return the plot as lines of text."""
         text = Text(no_wrap=True)
-        text.append(" " * (self._margin + 1) + title[: self.columns], style="bold")
+        width = self._margin + 1 + self.columns
+        pad = " " * min(self._margin + 1, max(0, width - len(title)))
+        text.append(pad + title[:width], style="bold")
         if self._note:
             pad = " " * (self._margin + 1 + max(0, (self.columns - len(self._note)) // 2))
             above, below = self.rows // 2, self.rows - self.rows // 2
@@ -122,14 +125,21 @@ class DotPlot:
                     text.append("●", style=mark)
                 else:
                     text.append(chr(_BLANK + dots) if dots else " ", style=style)
-        low, middle, high = _ticks(*self._x, 2)
-        high = f"{high} {x_unit}".rstrip()
-        axis = low + high.rjust(self.columns - len(low))
-        if self.columns >= 40:
-            place = (self.columns - len(middle)) // 2
-            axis = axis[:place] + middle + axis[place + len(middle) :]
-        text.append("\n" + " " * (self._margin + 1) + axis, style="dim")
+        text.append("\n" + " " * (self._margin + 1) + self._below(x_unit), style="dim")
         return text
+
+    def _below(self, unit: str) -> str:
+        """Return the labels of the x axis, each below its place, the last one with the unit."""
+        low, high = self._x
+        axis, end = [" "] * self.columns, self.columns
+        for x, label in reversed(axis_ticks(low, high)):
+            text = label if end < self.columns else f"{label} {unit}".rstrip()
+            place = round((x - low) / (high - low) * (self.columns - 1)) - len(label) // 2
+            place = max(0, min(place, self.columns - len(text)))
+            if place + len(text) <= end:
+                axis[place : place + len(text)] = text
+                end = place - 1
+        return "".join(axis)
 
     def _place(self, x: float, y: float) -> tuple[float, float]:
         """Column and row of the dot; far points are clipped to just outside."""
@@ -142,10 +152,6 @@ class DotPlot:
         if 0 <= c < 2 * self.columns and 0 <= r < 4 * self.rows:
             self._cells[r // 4][c // 2] |= _DOTS[c % 2][r % 4]
             self._styles[r // 4][c // 2] = style
-
-
-def _ticks(first: float, last: float, parts: int) -> list[str]:
-    return axis_labels([first + k * (last - first) / parts for k in range(parts + 1)])
 
 
 def _opened(low: float, high: float) -> tuple[float, float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from estimator.model import ParameterValue
 from estimator.sample import SIGMA_95
@@ -20,12 +19,15 @@ def number(value: float, digits: int = 4) -> str:
     return f"{value:.{max(0, min(decimals, max(digits, 4)))}f}".replace("-", "−")
 
 
-def axis_labels(values: Sequence[float]) -> list[str]:
-    """Return the labels of an axis' even places: one power of ten, and two digits of their distance."""
-    largest, apart = max(map(abs, values)), abs(values[1] - values[0])
-    if not (math.isfinite(largest) and math.isfinite(apart) and apart > 0.0):
-        return [number(value) for value in values]
-    return [_to_place(value, largest, math.floor(math.log10(apart)) - 1) for value in values]
+def axis_ticks(low: float, high: float) -> list[tuple[float, str]]:
+    """Return three to eight round places of an axis, with labels of one power of ten."""
+    power = 10.0 ** math.ceil(math.log10(high - low))
+    for step in (f * power for f in (0.5, 0.2, 0.1, 0.05, 0.02)):
+        places = [k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+        if len(places) >= 3:
+            break
+    largest, last = max(map(abs, places)), math.floor(math.log10(step) + 1e-9)
+    return [(place, _to_place(place, largest, last) if place else "0") for place in places]
 
 
 def among(value: float, largest: float, digits: int = 4) -> str:

@@ -72,7 +72,7 @@ class Fit:
 
         Args:
             other: the recording.
-            horizon_s: time between new starts from the measured state, s; left out: as `free_run` does.
+            horizon_s: time between new starts from the measured state, s; left out: a second, as in reports.
 
         Returns:
             Measured and simulated positions in rad, and the fit of each in %.

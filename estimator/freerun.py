@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.choices import choice
 from estimator.effects import Coordinates, EffectType, elements
 from estimator.errors import EstimatorError
 from estimator.filters import smoothed
@@ -21,7 +22,7 @@ from estimator.model import Effect, JointModel, Transmission
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import RIGID, TransmissionModel, transmission_model
 
-__all__ = ["Bodies", "FreeRun", "free_run", "nrmse_fit", "unbroken_s"]
+__all__ = ["Bodies", "FreeRun", "free_run", "nrmse_fit", "simulation_s", "unbroken_s"]
 
 _RESOLVED = 0.1
 _SMOOTHED = 21
@@ -77,8 +78,8 @@ def free_run(record: Record, model: JointModel, horizon_s: float | None = None) 
     Args:
         record: windows begin anew behind each gap.
         model: every flexible transmission has parameters.
-        horizon_s: length of a window, s; left out: the longest of 5 s, 2.5 s, 1.25 s, … whose fit is above
-            zero in every channel, which a drifting run is not.
+        horizon_s: length of a window, s; left out: that of reports (`simulation_s`), or the longest of its
+            half, its quarter, … whose fit is above zero in every channel, which a drifting run is not.
 
     Raises:
         EstimatorError: a transmission has no parameters, or no window fits into the recording.
@@ -86,15 +87,18 @@ def free_run(record: Record, model: JointModel, horizon_s: float | None = None) 
     model = without_hold([record], model)
     if horizon_s is not None:
         return _windows(record, model, horizon_s)
-    horizon = 5.0
-    while horizon > max(unbroken_s(record), 2 * _SMOOTHED * record.period_s):
-        horizon /= 2.0
+    horizon = simulation_s(record)
     while True:
         made = _windows(record, model, horizon)
         shorter = horizon / 2.0
         if min(made.fit_percent.values()) > 0.0 or shorter < 2 * _SMOOTHED * record.period_s:
             return made
         horizon = shorter
+
+
+def simulation_s(record: Record) -> float:
+    """Return the length of the windows in which a model is judged, s: a second, or what gaps leave of it."""
+    return min(choice("horizon"), unbroken_s(record))
 
 
 def unbroken_s(record: Record) -> float:

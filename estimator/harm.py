@@ -16,7 +16,7 @@ import numpy as np
 
 from estimator.choices import choice, whole
 from estimator.errors import EstimatorError
-from estimator.freerun import free_run, unbroken_s
+from estimator.freerun import free_run, simulation_s
 from estimator.model import JointModel
 from estimator.model_monitor import can_monitor, seconds_of
 from estimator.online import make_estimator
@@ -175,7 +175,7 @@ def _free_run(declared: JointModel, written: JointModel, unseen: Sequence[Unseen
     for record, since in unseen:
         part = record.rows(record.sequence >= since)
         try:
-            horizon_s = min(choice("horizon"), unbroken_s(part))
+            horizon_s = simulation_s(part)
             runs = [free_run(part, model, horizon_s) for model in (declared, written)]
         except EstimatorError:  # too short, or no stiffness is declared
             continue

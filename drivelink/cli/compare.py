@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("a", type=Path, metavar="A", help="joint file or recording")
     parser.add_argument("b", type=Path, metavar="B", help="joint file or recording")
     parser.add_argument("--joint", type=Path, metavar="JOINT", help="joint file of the recordings")
-    add_number(parser, "--horizon", metavar="S", help="time between new starts of a free run")
+    add_number(parser, "--horizon", metavar="S", help="time between new starts of a free run (default: 1)")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="write comparison.json and comparison.html there"
     )

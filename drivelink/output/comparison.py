@@ -15,10 +15,9 @@ from matplotlib.figure import Figure
 from drivelink.output import plots
 from drivelink.output.document import Chart, Document, Grid, Paragraph, Rows, Section, as_text
 from drivelink.output.numbers import Units, number, value_and_interval
-from estimator.choices import choice
 from estimator.comparison import Correlation, Curve, correlations, friction_curve, stiffness_curve
 from estimator.errors import EstimatorError
-from estimator.freerun import FreeRun, free_run, unbroken_s
+from estimator.freerun import FreeRun, free_run, simulation_s
 from estimator.model import JointModel
 from estimator.sample import SIGMA_95, Record
 
@@ -205,7 +204,7 @@ def simulated(record: Record, **models: JointModel) -> dict[str, FreeRun]:
     made = {}
     for name, model in models.items():
         with contextlib.suppress(EstimatorError):
-            made[name] = free_run(record, model, min(choice("horizon"), unbroken_s(record)))
+            made[name] = free_run(record, model, simulation_s(record))
     return made
 
 

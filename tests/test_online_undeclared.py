@@ -11,6 +11,7 @@ import onlinekit as kit
 import pytest
 from scipy.signal import lfilter
 
+from estimator import Status
 from sim.cases import case
 from sim.effects import make
 
@@ -51,6 +52,18 @@ def test_a_vsa_whose_shape_small_deflections_do_not_show_is_as_stiff_as_it_is():
     assert np.mean(estimates.valid[-8000:]) > 0.99
     assert np.all(off < 3.0 * estimates.std_nm_rad[-8000:])
     assert np.all(estimates.std_nm_rad[-8000:] < 0.01 * motion.stiffness_nm_rad[-8000:])
+
+
+def test_a_vsa_near_the_end_of_its_linkage_is_as_stiff_as_it_is_and_nothing_else():
+    large = dict(case("vsa-ii").rich, amplitude_nm=0.3)
+    motion = kit.motion("vsa-ii", 15.0, excitation=large)
+    estimates, estimator = kit.play(kit.declared("vsa-ii", parameters={}), motion.samples)
+    off = np.abs(estimates.stiffness_nm_rad / motion.stiffness_nm_rad - 1.0)[-10000:]
+    assert np.ptp(motion.stiffness_nm_rad) > 10.0 * np.min(motion.stiffness_nm_rad)
+    assert np.all(estimates.valid[-10000:])
+    assert np.median(off) < 0.001  # encoders, filters and rounding leave half of that
+    assert not any(estimator.undeclared())
+    assert not np.any(estimates.status & int(Status.CHANGED))
 
 
 def test_a_spring_of_another_stiffness_on_either_side_is_named_and_right():

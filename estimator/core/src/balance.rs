@@ -52,7 +52,7 @@ pub const TORQUE_SECOND: usize = 36;
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
 const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len() + 2; // columns that are functions of the raw φ
-const FORMED: usize = 13; // columns of lightly filtered signals: dry, soft, load ×2, late, read, stops ×3, sine ×2, cosine ×2
+const FORMED: usize = 15; // columns of lightly filtered signals: dry, soft, load ×2, late ×2, read ×2, stops ×3, sine ×2, cosine ×2
 
 /// What the columns are scaled by, taken from the motion.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -70,7 +70,8 @@ pub struct Size {
 pub struct Balance {
     /// What the columns are scaled by; zero before there was motion.
     pub size: Size,
-    family: Family,
+    /// The functions that the spring's curve is a sum of.
+    pub family: Family,
     position: Channel,
     torque: Channel,
     light: Lanes<3, CURVE>,
@@ -115,12 +116,6 @@ impl Balance {
     /// Forget how large the motion is.
     pub fn forget_range(&mut self) {
         (self.low, self.high) = (f64::INFINITY, f64::NEG_INFINITY);
-    }
-
-    /// The functions that the spring's curve is a sum of.
-    #[must_use]
-    pub fn family(&self) -> &Family {
-        &self.family
     }
 
     /// As if the joint had been here forever.
@@ -221,8 +216,6 @@ impl Balance {
         for columns in [LATE, READ, SINE, COSINE] {
             factors[columns.clone()].copy_from_slice(&terms[TERMS..TERMS + columns.len()]);
         }
-        // The first slope is 1 in every size; the columns of q are not filtered with it.
-        [LATE, READ, SINE, COSINE].iter().for_each(|columns| factors[columns.start] = 1.0);
         LOAD.iter().zip(&terms).for_each(|(column, factor)| factors[*column] = *factor);
         let mut curve = [1.0; CURVE];
         curve[..2 * TERMS].copy_from_slice(&terms);
@@ -231,9 +224,8 @@ impl Balance {
         (factors[CORNER], curve[CURVE - 1]) = (ratio * ratio, ratio * ratio);
         self.light.scale(&curve);
         self.curve.scale(&curve);
-        let slope = terms[TERMS + 1];
-        self.formed
-            .scale(&[1.0, 1.0, terms[0], terms[1], slope, slope, 1.0, 1.0, 1.0, 1.0, slope, 1.0, slope]);
+        let [a, b] = [terms[TERMS], terms[TERMS + 1]];
+        self.formed.scale(&[1.0, 1.0, terms[0], terms[1], a, b, a, b, 1.0, 1.0, 1.0, a, b, a, b]);
         factors
     }
 
@@ -261,7 +253,7 @@ impl Balance {
         let phi = link.light[0] - self.position.light[0];
         let u = self.unit(phi);
         let slopes = self.family.at(u, self.size.deflection);
-        let slope = slopes[TERMS + 1];
+        let [first, second] = [slopes[TERMS], slopes[TERMS + 1]];
         let speed = (SLOW * self.size.speed).max(f64::MIN_POSITIVE);
         let sign = (rate / speed).tanh();
         let step = (phi - self.last) / self.size.range.max(f64::MIN_POSITIVE);
@@ -275,16 +267,16 @@ impl Balance {
         let load = [slopes[0].abs() * sign, slopes[1].abs() * sign];
         let (sine, cosine) = q.sin_cos();
         self.waves = [sine, cosine];
-        let link = [-slope * q_rate, -slope * q, -a, -b, -c, -sine, -slope * sine, -cosine, -slope * cosine];
-        let mut now = [0.0; FORMED];
-        now[..4].copy_from_slice(&[sign, soft, load[0], load[1]]);
-        now[4..].copy_from_slice(&link);
+        let link = [q_rate, q, sine, cosine].map(|signal| [-first * signal, -second * signal]);
+        let mut now = [sign, soft, load[0], load[1], 0.0, 0.0, 0.0, 0.0, -a, -b, -c, 0.0, 0.0, 0.0, 0.0];
+        now[4..8].copy_from_slice(link[..2].as_flattened());
+        now[11..].copy_from_slice(link[2..].as_flattened());
         self.formed.smooth(&filters.main, now);
     }
 
     /// The row of this moment.
     #[must_use]
-    pub fn row(&self, link: &Channel) -> Row {
+    pub fn row(&self) -> Row {
         let mut row: Row = [0.0; COLUMNS];
         let [torque, rate, second, _] = self.torque.main;
         (row[TORQUE], row[TORQUE_RATE], row[TORQUE_SECOND]) = (torque - self.effects.main[0], rate, second);
@@ -295,10 +287,9 @@ impl Balance {
         row[SPRING.start..SPRING.start + 2 * TERMS].copy_from_slice(&curve[..2 * TERMS]);
         row[CLIPS].copy_from_slice(&curve[2 * TERMS..CURVE - 2]);
         (row[UNEVEN], row[CORNER]) = (curve[CURVE - 2], curve[CURVE - 1]);
-        (row[LATE.start], row[READ.start]) = (-link.main[1], -link.main[0]);
         let formed = &self.formed.state[0];
-        let places = [DRY, SOFT, LOAD[0], LOAD[1], LATE.start + 1, READ.start + 1];
-        let ranges = STOPS.chain(SINE).chain(COSINE);
+        let places = [DRY, SOFT, LOAD[0], LOAD[1]];
+        let ranges = LATE.chain(READ).chain(STOPS).chain(SINE).chain(COSINE);
         for (column, value) in places.into_iter().chain(ranges).zip(formed) {
             row[column] = *value;
         }

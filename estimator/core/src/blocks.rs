@@ -1,15 +1,16 @@
 //! What one motor's balance has taught: blocks of rows, and the algebra on their sum.
 
 mod changes;
+mod family;
 mod interval;
 mod readout;
 mod solve;
 
 use serde::{Deserialize, Serialize};
 
-use crate::balance::{self, Balance};
+use crate::balance;
 use crate::causes::{Noise, Odds};
-use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, REACHED, TAILS, UNUSUAL};
+use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, TAILS, UNUSUAL};
 use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse};
 use crate::model::Motor;
 use crate::settings::Priors;
@@ -28,6 +29,8 @@ pub enum Closed {
     Begun,
     /// It is not explained after a restart: the zero is not where it was.
     Lost,
+    /// What follows is learned with other functions.
+    Reformed,
 }
 
 /// What was known when the sum began anew, α and the zero as they are.
@@ -101,7 +104,8 @@ pub struct Blocks {
     pub readings: Readings,
     /// The least and the largest deflection since they are counted from where they are, rad.
     pub seen: [f64; 2],
-    family: Family,
+    /// The functions that the spring's curve is a sum of.
+    pub family: Family,
     located: bool, // a zero elsewhere, so well that the balance can be linearised
     /// How far a lost zero is from where deflections are counted from, rad; 0: near.
     pub off: f64,
@@ -199,6 +203,7 @@ impl Blocks {
         (self.posterior, self.frame) = (self.spring.declared_posterior(), None);
         (self.oldest, self.moved, self.skipped, self.fitted) = (0, false, 0, false);
         self.end_doubt();
+        self.unform();
         (self.noise.variance, self.own, self.torque, self.quick) = (f64::NAN, f64::NAN, f64::NAN, 0.0);
         self.unexplained = if self.posterior.is_some() { 0.0 } else { f64::NAN };
     }
@@ -263,7 +268,11 @@ impl Blocks {
     pub fn add(&mut self, row: &Row) -> Option<Closed> {
         let weight = self.weight(row);
         let row = &row.map(|value| weight.sqrt() * value);
-        if self.is_reference() {
+        if self.follow() {
+            return Some(Closed::Reformed);
+        }
+        let settled = self.doubting || self.skipped == 0;
+        if settled && self.is_reference() {
             let left = dot(row, &self.residual);
             self.quick += (self.period / LOOK_S).min(1.0) * (left * left - self.quick);
             if !self.doubting && self.is_beyond(row) {
@@ -381,19 +390,5 @@ impl Blocks {
     #[must_use]
     pub fn is_suspected(&self) -> bool {
         self.suspected
-    }
-
-    /// The spring's columns have grown by these factors.
-    pub fn grow(&mut self, factors: &Row, balance: &Balance) {
-        for gram in self.ring.iter_mut().chain(&mut self.waiting).chain([&mut self.open]) {
-            gram.scale(factors);
-        }
-        self.deflection = balance.size.deflection;
-        let reach = REACHED * self.spring.widest_reach(self.deflection);
-        self.projection = Some(Projection::new(balance.family(), self.deflection, reach));
-        self.powers = balance.family().powers();
-        if !self.ring.is_empty() {
-            self.solve();
-        }
     }
 }

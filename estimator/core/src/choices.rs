@@ -81,7 +81,7 @@ choices! {
     REST: f64 = 0.03, "", "share of what is left without a cause, that the right one may leave", "an effect that bends with the change";
     // Range.
     GROWN: f64 = 1.5, "", "times the range seen that a curve is used over", "beyond it, powers say nothing";
-    MARGIN: f64 = 1.1, "", "times the range seen that a law is projected on", "the next motion is a little larger";
+    MARGIN: f64 = 1.02, "", "times the range seen that a law is projected on", "the next motion is a little larger";
     REACHED: f64 = 0.98, "", "of where a law ends", "its slope is finite there";
     NEAR: f64 = 0.01, "jump", "a zero that comes back so near is as it was", "jumps are whole counts";
     SLOW: f64 = 0.02, "largest velocity", "over which dry friction changes its sign, and below which nothing is learned", "Stribeck speeds are faster";

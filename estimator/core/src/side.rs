@@ -301,13 +301,7 @@ impl Side {
     /// The row of this moment; what has been found to be shifted.
     ///
     /// `noise`: variances of θ and q; `torque_noise`: of τ; `gains`: of the filters for white noise.
-    pub fn learn(
-        &mut self,
-        link: &Channel,
-        noise: [f64; 2],
-        torque_noise: f64,
-        gains: &[f64; 3],
-    ) -> Option<Shift> {
+    pub fn learn(&mut self, noise: [f64; 2], torque_noise: f64, gains: &[f64; 3]) -> Option<Shift> {
         self.held_s = 0.0;
         self.unconfirmed_s -= self.period;
         let positions = noise[0] + noise[1];
@@ -320,7 +314,7 @@ impl Side {
             deflection: gains[0] * positions,
             resolution: (12.0 * positions).sqrt(),
         };
-        let row = self.balance.row(link);
+        let row = self.balance.row();
         let closed = self.blocks.add(&row)?;
         let doubted = self.doubtful;
         self.judge();
@@ -328,7 +322,7 @@ impl Side {
             Closed::Begun => self.followed_s = SAID_S,
             Closed::Added if doubted => self.deflection.recall(self.usual), // what was read since may be no motion
             Closed::Added => self.usual = self.deflection.motion(),
-            Closed::Unexplained => {}
+            Closed::Unexplained | Closed::Reformed => {}
             Closed::Lost => return Some(Shift::Lost),
         }
         let off = std::mem::take(&mut self.blocks.off);
@@ -355,6 +349,7 @@ impl Side {
         self.doubtful = self.blocks.is_doubting();
         self.unexplained = self.blocks.unexplained();
         self.fits = self.blocks.is_explained();
+        self.balance.family = self.blocks.family.clone();
     }
 
     /// The torque and stiffness that the deflection's filter goes on with.

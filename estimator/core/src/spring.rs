@@ -6,10 +6,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use std::sync::Arc;
-
-use crate::choices::MARGIN;
-use crate::laws::{Law, Table};
+use crate::choices::{MARGIN, REACHED};
+use crate::laws::Law;
 
 /// Functions of a family.
 pub const TERMS: usize = 5;
@@ -27,8 +25,8 @@ pub enum Family {
     Smooth,
     /// sign(u) |u|ᵏ: a spring whose stiffness has a corner at zero.
     Kinked,
-    /// g u^(2k−2), g the table's torque.
-    Table(Arc<Table>),
+    /// g |u|ᵏ⁻¹, or g u^(2k−2) of a law without a corner; g the law's torque with this shape.
+    Near(Law, f64),
 }
 
 impl Family {
@@ -37,7 +35,7 @@ impl Family {
     pub fn of(law: Option<&Law>) -> Family {
         match law {
             Some(Law::Exponential) => Family::Kinked,
-            Some(Law::Tabulated(table)) => Family::Table(table.clone()),
+            Some(law @ Law::Tabulated(_)) => Family::Near(law.clone(), 0.0),
             _ => Family::Smooth,
         }
     }
@@ -61,29 +59,34 @@ impl Family {
                     power *= u.abs();
                 }
             }
-            Family::Table(table) => {
-                let whole = table.at(size).0;
-                let (torque, slope) = table.at(u * size);
+            Family::Near(..) => {
+                let ((torque, slope), (whole, _)) = (self.law(u * size), self.law(size));
                 let (torque, slope) = (torque / whole, slope * size / whole);
-                let mut power = 1.0;
+                let (powers, mut power) = (self.powers(), 1.0);
+                let step = u.abs().powf(powers[1] - 1.0);
                 for k in 0..TERMS {
-                    let order = (2 * k) as f64;
-                    out[k] = torque * power;
-                    let bend =
-                        if k == 0 { 0.0 } else { order * torque * power / if u == 0.0 { 1.0 } else { u } };
-                    out[TERMS + k] = slope * power + bend;
-                    power *= u * u;
+                    let bend = (powers[k] - 1.0) * torque * power / if u == 0.0 { 1.0 } else { u };
+                    (out[k], out[TERMS + k]) = (torque * power, slope * power + bend);
+                    power *= step;
                 }
             }
         }
         out
     }
 
+    /// Torque and stiffness of the law that they are near to, with a k of 1; beyond its end as there.
+    fn law(&self, phi: f64) -> (f64, f64) {
+        let Family::Near(law, shape) = self else { return (phi, 1.0) };
+        let end =
+            if matches!(law, Law::Tabulated(_)) { f64::INFINITY } else { REACHED * law.reach(&[*shape]) };
+        law.at(phi.clamp(-end, end), &[1.0, *shape])
+    }
+
     /// Powers of u that the functions are, or nearly are.
     #[must_use]
     pub fn powers(&self) -> [f64; TERMS] {
         std::array::from_fn(|k| match self {
-            Family::Kinked => (k + 1) as f64,
+            Family::Kinked | Family::Near(Law::Exponential, _) => (k + 1) as f64,
             _ => (2 * k + 1) as f64,
         })
     }
@@ -93,7 +96,7 @@ impl Family {
     pub fn factors(&self, from: f64, to: f64) -> Coefficients {
         let (powers, ratio) = (self.powers(), from / to);
         let (less, whole) = match self {
-            Family::Table(table) => (1, table.at(from).0 / table.at(to).0),
+            Family::Near(..) => (1, self.law(from).0 / self.law(to).0),
             _ => (0, 1.0),
         };
         let mut out = [0.0; 2 * TERMS];
@@ -191,6 +194,8 @@ fn solve<const N: usize>(matrix: &[[f64; N]; N], b: &[f64; N], scale: &[f64; N])
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::laws::Table;
+    use std::sync::Arc;
 
     fn worst(law: &Law, alpha: &[f64], size: f64, zero: f64) -> f64 {
         let family = Family::of(Some(law));
@@ -216,9 +221,34 @@ mod tests {
     }
 
     #[test]
+    fn functions_near_a_law_hold_it_where_powers_do_not() {
+        for (law, alpha, near, size) in
+            [(Law::VsaII, [500.0, 1.75], 1.74, 1.1), (Law::Exponential, [100.0, 8.0], 7.0, 1.0)]
+        {
+            let left = |family: &Family| {
+                let projection = Projection::new(family, size, f64::INFINITY);
+                let sum = projection.of(|phi| law.at(phi, &alpha).0);
+                let at = |phi: f64| -> f64 {
+                    family.at(phi / size, size).iter().zip(&sum).map(|(b, a)| b * a).sum()
+                };
+                projection
+                    .nodes()
+                    .iter()
+                    .map(|phi| (at(*phi) - law.at(*phi, &alpha).0).abs())
+                    .fold(0.0, f64::max)
+            };
+            let most = 1e-3 * law.at(size, &alpha).0;
+            assert!(left(&Family::Near(law.clone(), near)) < most);
+            assert!(left(&Family::of(Some(&law))) > 10.0 * most);
+        }
+    }
+
+    #[test]
     fn a_larger_size_is_a_factor_of_each_function() {
-        let table = Family::Table(Arc::new(Table::new(&[0.05, 0.1, 0.2], &[3.0, 8.0, 30.0]).unwrap()));
-        for family in [Family::Smooth, Family::Kinked, table] {
+        let table = Arc::new(Table::new(&[0.05, 0.1, 0.2], &[3.0, 8.0, 30.0]).unwrap());
+        let near = [(Law::Tabulated(table), 0.0), (Law::VsaII, 1.7), (Law::Exponential, 8.0)]
+            .map(|(law, shape)| Family::Near(law, shape));
+        for family in [Family::Smooth, Family::Kinked].into_iter().chain(near) {
             let (before, factors) = (family.at(0.8, 0.1), family.factors(0.1, 0.2));
             let after = family.at(0.4, 0.2);
             assert!((0..2 * TERMS).all(|k| (before[k] * factors[k] - after[k]).abs() < 1e-12));

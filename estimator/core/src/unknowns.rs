@@ -346,7 +346,8 @@ impl Spring {
     }
 
     /// τ_e and σ of the law, whose zero may be elsewhere, and of the corner, which stays where it is declared.
-    fn curve(&self, phi: f64) -> (f64, f64) {
+    #[must_use]
+    pub fn curve(&self, phi: f64) -> (f64, f64) {
         let (torque, stiffness) = self.law.at(phi + self.zero, self.parameters());
         (torque + self.corner * phi * phi.abs(), stiffness + 2.0 * self.corner * phi.abs())
     }

@@ -31,7 +31,7 @@ fn the_row_of_a_known_joint_is_a_balance() {
         balance.feed(&filters, theta, q - theta, torque(t + 0.5 * T), &link, 0.0);
         balance.observe(q - theta, true);
         if k > 2000 {
-            let (row, size) = (balance.row(&link), balance.size.deflection);
+            let (row, size) = (balance.row(), balance.size.deflection);
             let sum = inertia * row[ACCELERATION]
                 + damping * row[VELOCITY]
                 + k1 * size * row[SPRING.start]
@@ -54,7 +54,7 @@ fn moved(balance: &mut Balance, from: u32, to: u32, amplitude: f64) -> Row {
             balance.observe(q, true);
         }
     }
-    balance.row(&link)
+    balance.row()
 }
 
 #[test]
@@ -76,9 +76,9 @@ fn columns_that_have_grown_are_those_of_a_joint_that_was_larger_from_the_start()
     moved(&mut grown, 0, 2500, 0.01);
     let mut link = Channel::rest(0.0);
     link.smooth(&Filters::new(60.0, T), 0.0);
-    let before = grown.row(&link);
+    let before = grown.row();
     let factors = grown.grow(0.02);
-    let after = grown.row(&link);
+    let after = grown.row();
     for column in SPRING.chain(SLOPE).chain([CORNER]) {
         assert!((before[column] * factors[column] - after[column]).abs() < 1e-12, "{column}");
     }

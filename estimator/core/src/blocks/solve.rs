@@ -2,7 +2,7 @@
 
 use super::Blocks;
 use crate::balance;
-use crate::choices::{ACCUSED, EXACT, FEWEST, MARGIN, REACHED, SURE};
+use crate::choices::{ACCUSED, EXACT, FEWEST, REACHED, SURE};
 use crate::gram::{
     COLUMNS, Frame, Gram, Posterior, Prior, Reduced, Row, Set, UNKNOWNS, choose, dot, log_evidence, set,
     solve, unknowns,
@@ -129,19 +129,6 @@ impl Blocks {
         true
     }
 
-    /// Deflections that were counted from elsewhere may have been larger than the joint's: the law is known over those
-    /// since. Near its end, or beyond it, no sum of few functions is the law.
-    fn fit_projection(&mut self) {
-        let [low, high] = self.seen;
-        if !self.lost || high <= low {
-            return;
-        }
-        let (ends, zero) = (REACHED * self.spring.reach(), self.spring.zero);
-        let more = (MARGIN - 1.0) * (high - low);
-        let (low, high) = ((low - more).max(-ends - zero), (high + more).min(ends - zero));
-        self.projection = Some(Projection::between(&self.family, self.deflection, low, high));
-    }
-
     /// Where the first blocks' iteration begins.
     fn begin(&mut self, total: &Gram, torque: f64) {
         if self.noise.variance.is_nan() {
@@ -164,6 +151,9 @@ impl Blocks {
 
     /// The unknowns from all blocks.
     pub(super) fn solve(&mut self) {
+        if self.reform() {
+            return;
+        }
         let mut total = Gram::default();
         self.ring.iter().for_each(|block| total.add(block, 1.0));
         let torque = balance::variance(&total, balance::TORQUE).max(f64::MIN_POSITIVE);
@@ -358,43 +348,4 @@ impl Blocks {
 /// Unknowns whose shapes no joint has quite: friction, memory, the free curve.
 fn shaped() -> Set {
     set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS) | set(CLIPS)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::model::{Motor, Transmission};
-    use crate::settings::Priors;
-
-    #[test]
-    fn a_law_is_known_where_the_joint_is_however_large_a_deflection_has_seemed() {
-        let transmission = Transmission::Elastic {
-            law: Law::VsaII,
-            order: None,
-            parameters: vec![0.5, 1.75],
-            covariance: None,
-        };
-        let motor = Motor::bare(5e-4, 5e-3, transmission);
-        let [low, high] = [-0.6, 0.15]; // it ends at 1.2 rad
-        for size in [1.8, 1.05] {
-            let mut blocks = Blocks::new(&motor, &Priors::USUAL, 1e-3, 100.0, 75, 1.0);
-            (blocks.deflection, blocks.seen, blocks.spring.zero) = (size, [low, high], 0.05);
-            let off = |blocks: &Blocks| {
-                let curve = blocks.spring.torque(blocks.projection.as_ref().unwrap());
-                let error = |k: i32| {
-                    let phi = low + (high - low) * f64::from(k) / 50.0;
-                    let terms = blocks.family.at(phi / size, size);
-                    let sum: f64 = terms.iter().zip(&curve).map(|(b, a)| b * a).sum();
-                    (sum - blocks.spring.law.at(phi + 0.05, &[0.5, 1.75]).0).abs()
-                };
-                (0..=50).map(error).fold(0.0, f64::max)
-            };
-            let torque = blocks.spring.law.at(low, &[0.5, 1.75]).0.abs();
-            blocks.projection = Some(Projection::new(&blocks.family, size, f64::INFINITY));
-            assert!(off(&blocks) > EXACT * torque);
-            blocks.lost = true;
-            blocks.fit_projection();
-            assert!(off(&blocks) < EXACT * torque, "{} of {torque}", off(&blocks));
-        }
-    }
 }

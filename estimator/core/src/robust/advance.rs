@@ -76,7 +76,7 @@ impl Robust {
             // Where both readings stand, their rounding is no noise, and what they say has been said.
             if usable && side.excited && u64::from(self.validator.stood(i)) <= self.looks {
                 side.blocks.spoilt = self.live.refused.is_some();
-                shifts[i] = side.learn(link, noise, torque_noise, &self.noise_gains);
+                shifts[i] = side.learn(noise, torque_noise, &self.noise_gains);
             }
         }
         shifts

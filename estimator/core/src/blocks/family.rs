@@ -1,0 +1,162 @@
+//! The functions that a spring's curve is a sum of, and where that sum is the law.
+
+use super::Blocks;
+use crate::balance::Balance;
+use crate::choices::{EXACT, FEWEST, MARGIN, REACHED};
+use crate::gram::{Gram, Row, set};
+use crate::laws::Law;
+use crate::spring::{Family, NODES, Projection};
+use crate::unknowns::{SPRING, ZERO};
+
+impl Blocks {
+    /// The spring's columns have grown by these factors.
+    pub fn grow(&mut self, factors: &Row, balance: &Balance) {
+        for gram in self.ring.iter_mut().chain(&mut self.waiting).chain([&mut self.open]) {
+            gram.scale(factors);
+        }
+        self.deflection = balance.size.deflection;
+        let reach = REACHED * self.spring.widest_reach(self.deflection);
+        self.projection = Some(Projection::new(&self.family, self.deflection, reach));
+        self.powers = self.family.powers();
+        if !self.ring.is_empty() {
+            self.solve();
+        }
+    }
+
+    /// The law is known over the deflections that the joint has had: near its end, or beyond it, no sum of few functions
+    /// is the law. Where the zero is lost, they were counted from elsewhere before.
+    pub(super) fn fit_projection(&mut self) {
+        let [low, high] = self.seen;
+        if high <= low {
+            return;
+        }
+        let (low, high) = if self.lost {
+            let (ends, zero) = (REACHED * self.spring.reach(), self.spring.zero);
+            let more = (MARGIN - 1.0) * (high - low);
+            ((low - more).max(-ends - zero), (high + more).min(ends - zero))
+        } else {
+            let largest = high.max(-low);
+            let edge = (MARGIN * largest).min(REACHED * self.spring.widest_reach(largest));
+            (-edge, edge)
+        };
+        self.projection = Some(Projection::between(&self.family, self.deflection, low, high));
+    }
+
+    /// Where a deflection goes further than any before, the law is fitted anew; whether its functions are others now.
+    pub(super) fn follow(&mut self) -> bool {
+        let Some(projection) = self.projection.as_ref().filter(|_| !self.lost && self.frame.is_some()) else {
+            return false;
+        };
+        let [low, high] = self.seen;
+        let (largest, end) = (high.max(-low), projection.nodes()[NODES - 1]);
+        if !self.is_shaped() || largest <= end || end >= REACHED * self.spring.reach() {
+            return false;
+        }
+        let reformed = self.reform();
+        if !reformed {
+            self.restate();
+        }
+        reformed
+    }
+
+    /// Functions near the law as it is known, where the present ones do not hold it: what follows is learned with them.
+    ///
+    /// What has been learned of all but the spring is carried over; rows are sums of the functions before, and are
+    /// forgotten. Whether that has been done.
+    pub(super) fn reform(&mut self) -> bool {
+        if self.lost || self.moved || self.doubting {
+            return false;
+        }
+        self.fit_projection();
+        let known = self.posterior.is_some() && (self.ring.len() >= FEWEST || self.spring.is_anchored());
+        let possible = self.is_shaped() && self.seen[1].max(-self.seen[0]) < REACHED * self.spring.reach();
+        let Some(projection) = self.projection.as_ref().filter(|_| known && possible) else { return false };
+        if self.is_held(projection) {
+            return false;
+        }
+        self.family = Family::Near(self.spring.law.clone(), self.spring.parameters()[1]);
+        self.powers = self.family.powers();
+        self.carry_over(set(SPRING) | 1 << ZERO);
+        self.ring.clear();
+        self.peaks.clear();
+        (self.oldest, self.open, self.skipped) = (0, Gram::default(), self.settle);
+        self.fit_projection();
+        self.restate();
+        true
+    }
+
+    /// Whether no sum of few powers is the law, and functions near it are quickly had.
+    fn is_shaped(&self) -> bool {
+        matches!(self.spring.law, Law::VsaII | Law::Exponential)
+    }
+
+    /// Whether the sum of the functions is the law where it is fitted.
+    fn is_held(&self, projection: &Projection) -> bool {
+        let (sum, mut left, mut all) = (self.spring.torque(projection), 0.0, 0.0);
+        for phi in projection.nodes() {
+            let terms = self.family.at(phi / self.deflection, self.deflection);
+            let torque = self.spring.curve(*phi).0;
+            left += (terms.iter().zip(&sum).map(|(b, a)| b * a).sum::<f64>() - torque).powi(2);
+            all += torque * torque;
+        }
+        left <= EXACT * EXACT * all
+    }
+
+    /// What is known, in the present functions.
+    fn restate(&mut self) {
+        let (Some(projection), Some(known)) = (&self.projection, &mut self.posterior) else { return };
+        let frame = self.spring.frame(projection);
+        for unknown in SPRING.chain([ZERO]) {
+            known.x[unknown] = 0.0; // counted from where it is
+        }
+        self.residual = frame.residual(&known.x, known.set);
+        self.frame = Some(frame);
+    }
+
+    /// The functions that hold any law, near which none is known.
+    pub(super) fn unform(&mut self) {
+        if self.is_shaped() && matches!(self.family, Family::Near(..)) {
+            self.family = Family::of(Some(&self.spring.law));
+            (self.powers, self.skipped) = (self.family.powers(), self.settle);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{Motor, Transmission};
+    use crate::settings::Priors;
+
+    #[test]
+    fn a_law_is_known_where_the_joint_is_however_large_a_deflection_has_seemed() {
+        let transmission = Transmission::Elastic {
+            law: Law::VsaII,
+            order: None,
+            parameters: vec![0.5, 1.75],
+            covariance: None,
+        };
+        let motor = Motor::bare(5e-4, 5e-3, transmission);
+        let [low, high] = [-0.6, 0.15]; // it ends at 1.2 rad
+        for size in [1.8, 1.05] {
+            let mut blocks = Blocks::new(&motor, &Priors::USUAL, 1e-3, 100.0, 75, 1.0);
+            (blocks.deflection, blocks.seen, blocks.spring.zero) = (size, [low, high], 0.05);
+            let off = |blocks: &Blocks| {
+                let curve = blocks.spring.torque(blocks.projection.as_ref().unwrap());
+                let error = |k: i32| {
+                    let phi = low + (high - low) * f64::from(k) / 50.0;
+                    let terms = blocks.family.at(phi / size, size);
+                    let sum: f64 = terms.iter().zip(&curve).map(|(b, a)| b * a).sum();
+                    (sum - blocks.spring.law.at(phi + 0.05, &[0.5, 1.75]).0).abs()
+                };
+                (0..=50).map(error).fold(0.0, f64::max)
+            };
+            let torque = blocks.spring.law.at(low, &[0.5, 1.75]).0.abs();
+            blocks.projection = Some(Projection::new(&blocks.family, size, f64::INFINITY));
+            assert!(off(&blocks) > EXACT * torque);
+            blocks.lost = true;
+            blocks.fit_projection();
+            assert!(off(&blocks) < EXACT * torque, "{} of {torque}", off(&blocks));
+        }
+    }
+}

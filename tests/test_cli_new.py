@@ -74,7 +74,7 @@ def test_the_inertia_of_a_data_sheet_goes_through_the_gear(tmp_path, capsys):
 
 def test_questions_are_asked_where_somebody_can_answer(tmp_path, monkeypatch, capsys):
     questions = []
-    text = "duble,antagonistic,,50,,heavy,48.2,,,none,,socketcan,can3,200,7,8,none,drive"
+    text = "duble,antagonistic,-3,,50,,heavy,48.2,,,none,,socketcan,can3,200,7,8,none,drive"
     replies = iter(text.split(","))
 
     def answer(question):
@@ -90,7 +90,8 @@ def test_questions_are_asked_where_somebody_can_answer(tmp_path, monkeypatch, ca
     out = capsys.readouterr().out
     assert "48.2 g·cm² × 50² = 0.01205 kg·m²" in out
     # What contradicts an earlier answer is asked again, and throws none away.
-    assert "transmission: expected a flexible one" in out and "--encoder none: expected --model none" in out
+    assert "transmission: expected a flexible one" in out and "\nexpected --model none" in out
+    assert "--gear" not in out and "--encoder" not in out  # nobody has given an option
     assert joint.bus.channel == "can3"
     assert [motor.drive.node_id for motor in joint.motor] == [7, 8]
 

@@ -52,7 +52,7 @@ def test_two_machines_differ_in_the_stiffness_and_each_model_fits_its_own(runs):
     out = io.StringIO()
     show(made.sections(), Console(file=out, width=80))
     assert re.search(
-        r"│ friction +│ N·m +│ +\S+ │ +\S+ │ +\S+ rad/s │ +\S+ σ │\n", out.getvalue()
+        r"│ friction / N·m +│ +\S+ │ +\S+ │ +\S+ rad/s │ +\S+ σ │\n", out.getvalue()
     )  # no cell folds
     assert abs(stiffness.b / stiffness.a - 0.9) < 0.02
     assert abs(stiffness.b - stiffness.a) > 10.0 * stiffness.std > 0.0

@@ -256,7 +256,7 @@ def test_a_linear_axis_is_moved_in_millimetres_and_pushed_in_newtons():
     rig = HandMovedJoint({})
     done = check_by_hand(joint(axis="linear"), rig, rig)
     assert done.good and done.paste == []
-    assert any("+51 mm (+0.051) for +50 mm (+0.05)" in line for line in rig.said)
+    assert any("+51 mm (+0.051 m) for +50 mm (+0.05 m)" in line for line in rig.said)
     assert any("-1.5 N against the push" in line for line in rig.said)
     rig = HandMovedJoint({"link_position": 1e3}, {"Move": "0.051 m"})  # counts taken for millimetres
     done = check_by_hand(joint(axis="linear"), rig, rig)

@@ -451,3 +451,9 @@ def test_a_diagnosis_that_waits_for_the_processors_says_so(tmp_path, monkeypatch
         now_s += 1.0
         diagnoses.step()
     assert finding.line(finding.read(made)) == "the model is sufficient"
+
+
+def test_what_lies_in_the_folder_is_no_program(tmp_path):
+    path = tmp_path / "elbow.day.csv"
+    with open(path, "a", encoding="ascii", opener=finding.open_own):
+        assert not path.stat().st_mode & 0o111

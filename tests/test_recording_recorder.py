@@ -3,6 +3,7 @@
 import json
 import signal
 from contextlib import ExitStack
+from pathlib import Path
 
 import daemonkit
 import zenohkit
@@ -123,3 +124,13 @@ def test_a_bus_is_recorded_by_listening_only(tmp_path):
         found = [tuple(row) for row in read(tmp_path / name, joint).motor_position_rad.tolist()]
         # The last sample is recorded when its cycle has ended.
         assert len(found) >= least and found == samples[len(samples) - len(found) :][: len(found)], name
+
+
+def test_the_line_that_was_rewritten_is_erased_before_the_result(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    joint = jointfile.load(Path(jointfile.__file__).parents[1] / "joints" / "vsa-ii.toml")
+    with Recorder(open_sink(tmp_path / "a.csv", joint, ""), []) as recorder:
+        summary = _Summary(tmp_path / "a.csv", recorder)
+        summary.tick()
+        summary.clear()
+    assert capsys.readouterr().err.endswith("Ctrl-C ends \r\x1b[K")

@@ -274,3 +274,12 @@ def test_the_same_data_are_the_same_file(suffix, tmp_path):
         over_time(axes, {"φ": PlotCurve(t, phi)}, "φ / rad")
         contents.append(save(figure, tmp_path / f"{name}{suffix}").read_bytes())
     assert contents[0] == contents[1]
+
+
+def test_a_power_of_ten_stands_beside_the_legend_not_in_it():
+    figure, (axes,) = plots.new_figure()
+    one = plots.PlotCurve(np.arange(3.0), 4.6e6 + np.arange(3.0), np.ones(3))
+    plots.xy(axes, {"a": one, "b": one}, "x", "y")
+    figure.draw_without_rendering()
+    power, legend = axes.yaxis.get_offset_text().get_window_extent(), axes.get_legend().get_window_extent()
+    assert power.width > 0 and not power.overlaps(legend)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 import sys
 import sysconfig
@@ -279,4 +280,4 @@ def _asked(question: str, default: Any, check: Callable[[str], Any], *, needed: 
         try:
             return check(reply)
         except UsageError as error:
-            print(error)
+            print(re.sub(r"^--[^:]+: ", "", str(error)))  # who is asked has given no option

@@ -89,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
         end = time.monotonic() + args.seconds if args.seconds else float("inf")
         say = _Summary(args.out, recorder)
         recorder.run(lambda: stopped.is_set() or time.monotonic() >= end, say.tick)
+        say.clear()
     print(json.dumps(say.document()) if args.json else f"{args.out}: {say.text()}")
     if not any(recorder.sink.counts.get(kind) for kind in ("sample", "estimate", "frame")):
         for path in (args.out, side_file(args.out)):
@@ -241,6 +242,11 @@ class _Summary:
         elif time.monotonic() >= self._next:
             self._next += _SAY_EVERY_S
             _say(f"{self._path}: {self.text()}")
+
+    def clear(self) -> None:
+        """Erase the line that was rewritten on a terminal."""
+        if sys.stderr.isatty():
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
 def _say(text: str) -> None:

@@ -31,6 +31,7 @@ class _Axis(NamedTuple):
     asked: float  # default amount, rad or m
     unit: str  # everyday unit as printed after a number; a scale may be wrong by it
     everyday: float  # its value in rad or m
+    si: str
     units: Mapping[str, float]  # accepted units in rad or m
     example: str  # amounts
     force: str  # unit of what a motor exerts
@@ -38,7 +39,7 @@ class _Axis(NamedTuple):
 
     def shown(self, value: float) -> str:
         """Return an amount in the everyday unit and in SI."""
-        return f"{value / self.everyday:+.4g}{self.unit} ({value:+.3g})"
+        return f"{value / self.everyday:+.4g}{self.unit} ({value:+.3g} {self.si})"
 
 
 _DEGREE = math.pi / 180.0
@@ -47,6 +48,7 @@ _ROTARY = _Axis(
     asked=math.pi / 2.0,
     unit="°",
     everyday=_DEGREE,
+    si="rad",
     units={"": _DEGREE, "°": _DEGREE, "deg": _DEGREE, "rad": 1.0},
     example="45 or 0.8 rad",
     force="N·m",
@@ -57,6 +59,7 @@ _LINEAR = _Axis(
     asked=0.05,
     unit=" mm",
     everyday=1e-3,
+    si="m",
     units={"": 1e-3, "mm": 1e-3, "m": 1.0},
     example="50 or 0.2 m",
     force="N",

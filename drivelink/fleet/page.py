@@ -191,9 +191,9 @@ def _figure(joint: dict[str, Any], one: dict[str, Any]) -> str:
     caption = (
         f"Stiffness{several} at a deflection of {one['deflection_rad']:.3g} "
         f"{one['deflection_unit']}, {one['unit']}; scatter "
-        f"{100 * one['scatter_relative']:.2g} %, q = {one['q_value']:.2g}. × at the bottom: a recording that "
-        "shows no stiffness; hollow: the model was not sufficient; dots below: an effect was found at that "
-        "place. A click opens the diagnosis."
+        f"{100 * one['scatter_relative']:.2g} %, q = {number(one['q_value'], 2)}. A cross at the bottom is a "
+        "recording that shows no stiffness, a hollow dot a model that was not sufficient, a dot below the "
+        "axis an effect that was found at that place. A click opens the diagnosis."
     )
     return f'<figure class="large">{charts}<figcaption>{html.escape(caption)}</figcaption></figure>'
 
@@ -330,7 +330,7 @@ def _effects(joint: dict[str, Any]) -> list[Grid]:
                 Markup(_link(effect["report"], "diagnosis")),
             )
         )
-    return [Grid(("found", "at", "in", "", "error without → with it", ""), rows)] if rows else []
+    return [Grid(("found", "at", "in", "", "error without → with it, median", ""), rows)] if rows else []
 
 
 def _diagnoses(joint: dict[str, Any]) -> str:

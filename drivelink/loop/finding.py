@@ -193,7 +193,7 @@ def open_own(path: str, flags: int) -> int:
     Raises:
         OSError: it is one of them, or cannot be opened.
     """
-    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
 
 
 def newest(folder: Path, joint: str, *, finished: bool = False) -> tuple[Path, dict[str, Any]] | None:

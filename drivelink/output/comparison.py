@@ -149,20 +149,20 @@ class Comparison:
     def _differences(self) -> Grid:
         rows: Rows = []
         for one in self.differences():
-            unit = self.units.shown("N·m/rad" if one.kind == "stiffness" else "N·m")
+            unit = self.units.shown("(N·m/rad)" if one.kind == "stiffness" else "N·m")
             apart = f"{abs(one.b - one.a) / one.std:.1f} σ" if one.std > 0.0 else "–"
             at = f"{number(one.at, 3)} {self.units.shown('rad' if one.kind == 'stiffness' else 'rad/s')}"
             a, b = (value_and_interval(value, SIGMA_95 * one.std)[0] for value in (one.a, one.b))
             if (f"motor {one.motor}",) not in rows:
                 rows.append((f"motor {one.motor}",))
-            rows.append((one.kind, unit, a, b, at, apart))
+            rows.append((f"{one.kind} / {unit}", a, b, at, apart))
         for motor in range(len(self.sides[0].model.motors)):
             known = [letter for letter, _ in self.curves(motor)["stiffness"]]
             if len(known) < 2 and all(side.model.motors[motor].flexible for side in self.sides):
                 each = ["known" if letter in known else "not known" for letter in "AB"]
                 rows += [(f"motor {motor + 1}",)] if (f"motor {motor + 1}",) not in rows else []
-                rows.insert(rows.index((f"motor {motor + 1}",)) + 1, ("stiffness", "", *each, "", ""))
-        return Grid(("", "unit", "A", "B", "at", "apart"), rows)
+                rows.insert(rows.index((f"motor {motor + 1}",)) + 1, ("stiffness", *each, "", ""))
+        return Grid(("", "A", "B", "at", "apart"), rows)
 
     def _over(self, side: Side, runs: Sequence[FreeRun]) -> Figure:
         run, j = runs[0], self.channel(runs[0])

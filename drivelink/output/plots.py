@@ -200,6 +200,7 @@ def _draw(axes: Axes, curve: PlotCurve, name: str, k: int) -> None:
 def _finish(axes: Axes, x_label: str, y_label: str, title: str, legend: bool) -> None:
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
+    axes.yaxis.get_offset_text().set_horizontalalignment("right")  # a power of ten, beside the legend
     named = legend or len(axes.get_legend_handles_labels()[0]) > 1
     if title:
         axes.set_title(title, loc="left", pad=20.0 if named else None)

@@ -144,6 +144,7 @@ def test_what_is_not_valid_is_a_gap_and_both_plots_share_their_time_axis(tmp_pat
     plot_over_time(columns, tmp_path / "time.png", "elbow")
     for axes in figures[0].axes:
         assert np.nanmax(axes.lines[0].get_ydata()) < 2.0
+        assert np.nanmin(axes.lines[1].get_ydata()) == 1e6 and axes.get_ylim()[1] < 2.0  # grey, and no scale
     torque, stiffness = figures[0].axes
     assert torque.get_xlim() == stiffness.get_xlim() == (t[0], t[-1])
     for axes in figures[0].axes:  # which part of the recording that is, is said

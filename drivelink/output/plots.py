@@ -244,21 +244,26 @@ def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) ->
     """Draw flexibility torque and stiffness over the whole recording; grey where each is not valid."""
     figure, axes = new_figure(title, rows=2)
     t = columns["time_s"]
-    valid = {name: np.where(columns["valid"] > 0, values, np.nan) for name, values in columns.items()}
     axes[1].sharex(axes[0])
     axes[0].set_xlim(t[0], t[-1] if t[-1] > t[0] else None)
-    for one, seen in zip(axes, ("torque_valid", "valid"), strict=True):
-        whole, void = one.get_xaxis_transform(), columns[seen] <= 0
-        if np.any(void):
+    for one, seen, name, label in (
+        (axes[0], "torque_valid", "flexibility_torque", "torque / N·m"),
+        (axes[1], "valid", "stiffness", "stiffness / (N·m/rad)"),
+    ):
+        unit = "nm_rad" if name == "stiffness" else "nm"
+        y, std, valid = columns[f"{name}_{unit}"], columns[f"{name}_std_{unit}"], columns[seen] > 0
+        if not np.all(valid):
+            whole = one.get_xaxis_transform()
             one.fill_between(
-                t, 0, 1, where=void, transform=whole, color="#bbbbbb", lw=0, alpha=0.4, label="not valid"
+                t, 0, 1, where=~valid, transform=whole, color="#bbbbbb", lw=0, alpha=0.4, label="not valid"
             )
-    torque = np.where(columns["torque_valid"] > 0, columns["flexibility_torque_nm"], np.nan)
-    curve = PlotCurve(t, torque, columns["flexibility_torque_std_nm"])
-    over_time(axes[0], {"estimate": curve}, "torque / N·m", "Flexibility torque")
-    stiffness = PlotCurve(t, valid["stiffness_nm_rad"], valid["stiffness_std_nm_rad"])
-    over_time(axes[1], {"estimate": stiffness}, "stiffness / (N·m/rad)", "Stiffness")
-    low, high = np.nanpercentile(stiffness.y, [1, 99]) if np.any(np.isfinite(stiffness.y)) else (0.0, 1.0)
-    margin = 0.25 * (high - low) + 0.02 * abs(high)
-    axes[1].set_ylim(low - margin, high + margin)  # the wide band of the first samples would hide the rest
+        curve = PlotCurve(t, np.where(valid, y, np.nan), std)
+        over_time(one, {"estimate": curve}, label, name.replace("_", " ").capitalize())
+        doubtful = _thinned(_with_gaps(PlotCurve(t, np.where(valid, np.nan, y))))
+        one.plot(doubtful.x, doubtful.y, color="#999999", linewidth=0.8)
+        # The wide band of the first samples would hide the rest, and so would what is not valid.
+        known = y[valid & np.isfinite(y)] if np.any(valid & np.isfinite(y)) else y[np.isfinite(y)]
+        low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
+        margin = 0.25 * (high - low) + 0.02 * abs(high)
+        one.set_ylim(low - margin, high + margin)
     return save(figure, path)

@@ -256,7 +256,7 @@ def _choice_of(outcome: Diagnosis, chosen: list[float]) -> str:
 def _curve_chart(curve: Curve, units: Units) -> Chart:
     over = " and ".join(name.replace("_", " ") for name in curve.coordinates)
     name = "a free curve" if curve.name == "unlisted" else in_words(curve.name)
-    about = f", {LIBRARY[curve.name].description}" if curve.name in LIBRARY else ""
+    about = f": {LIBRARY[curve.name].description}" if curve.name in LIBRARY else ""
     caption = f"Residual of the declared model over {over}, and {name}{about}."
     return Chart(partial(_curve_figure, curve, units), caption)
 

@@ -26,7 +26,6 @@ from drivelink.monitor.terminal import can_draw, joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.web import snapshot
 from drivelink.output.numbers import number, with_interval
-from drivelink.plaintext import natural
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
@@ -350,15 +349,6 @@ def test_several_joints_are_one_line_each_and_no_column_is_cut_off():
         assert all(len(line) <= width and "…" not in line for line in shown), shown
 
 
-def test_nodes_and_joints_are_in_natural_order():
-    names = ["10", "2", "1"]
-    said = [f"node {name}: frames are missing" for name in names]
-    shown = shape({"nodes": {name: {} for name in names}, "conditions": said})
-    assert [node.id for node in shown.nodes] == ["1", "2", "10"]
-    assert shown.wrong == ("nodes 1, 2, 10: frames are missing",)
-    assert sorted(["b-10", "b-2", "2", "b-02b", "b"], key=natural) == ["2", "b", "b-2", "b-02b", "b-10"]
-
-
 def test_without_a_bus_no_node_is_operational_and_what_several_nodes_lack_is_said_once():
     view = filled()
     view.status = view.status | {
@@ -368,6 +358,14 @@ def test_without_a_bus_no_node_is_operational_and_what_several_nodes_lack_is_sai
     text = "\n".join(lines(view, 120, 40))
     assert "1 not heard" in text and "operational" not in text
     assert "nodes 1, 2: frames are missing" in text
+
+
+def test_why_no_estimate_was_valid_is_not_said_of_one_that_is():
+    view = filled()
+    view.status = view.status | {"not_valid": "filters are settling"}  # a few times a second
+    assert "settling" not in view.line() and "settling" not in "\n".join(lines(view, 120, 40))
+    view.update(estimate(6000, status=0), 6.0)
+    assert "settling" in view.line()
 
 
 def test_an_error_of_the_valid_cycles_does_not_stand_beside_an_estimate_that_is_not():

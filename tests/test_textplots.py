@@ -1,9 +1,13 @@
-"""Plots in a terminal: round places on their axes, titles that are whole."""
+"""Text in a terminal: plots with round places on their axes and whole titles, names in natural order."""
+
+import itertools
 
 import pytest
 
 from drivelink.monitor.braille import DotPlot
+from drivelink.monitor.statuslines import shape
 from drivelink.output.numbers import axis_ticks
+from drivelink.plaintext import natural
 
 
 @pytest.mark.parametrize(
@@ -36,3 +40,21 @@ def test_labels_stand_at_their_places_and_the_title_is_whole():
     assert rows[5].startswith("     0┤") and below.endswith("0 s")
     at = below.index("−10") + 1
     assert abs(at - (7 + 2.0 / 12.0 * 29)) <= 1.0
+
+
+@pytest.mark.parametrize("columns", range(12, 60))
+def test_labels_below_are_evenly_apart_or_fewer(columns):
+    below = DotPlot(columns + 7, 13, (-0.41, 0.43), (0.0, 1.0)).render("", "rad").plain.split("\n")[-1]
+    *labels, unit = below.split()
+    values = [float(label.replace("−", "-")) for label in labels]
+    apart = {round(b - a, 6) for a, b in itertools.pairwise(values)}
+    assert unit == "rad" and len(apart) <= 1 and len(below) <= columns + 7
+
+
+def test_nodes_and_joints_are_in_natural_order():
+    names = ["10", "2", "1"]
+    said = [f"node {name}: frames are missing" for name in names]
+    shown = shape({"nodes": {name: {} for name in names}, "conditions": said})
+    assert [node.id for node in shown.nodes] == ["1", "2", "10"]
+    assert shown.wrong == ("nodes 1, 2, 10: frames are missing",)
+    assert sorted(["b-10", "b-2", "2", "b-02b", "b"], key=natural) == ["2", "b", "b-2", "b-02b", "b-10"]

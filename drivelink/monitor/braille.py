@@ -130,16 +130,22 @@ class DotPlot:
 
     def _below(self, unit: str) -> str:
         """Return the labels of the x axis, each below its place, the last one with the unit."""
+        ticks = axis_ticks(*self._x)
+        strides = (self._laid(ticks[::stride], unit) for stride in range(1, len(ticks) + 1))
+        return next((axis for axis in strides if axis is not None), "")
+
+    def _laid(self, ticks: Sequence[tuple[float, str]], unit: str) -> str | None:
+        """Return the labels as a line; None where they do not fit."""
         low, high = self._x
-        axis, end = [" "] * self.columns, self.columns
-        for x, label in reversed(axis_ticks(low, high)):
-            text = label if end < self.columns else f"{label} {unit}".rstrip()
+        axis = ""
+        for k, (x, label) in enumerate(ticks):
+            text = f"{label} {unit}".rstrip() if k == len(ticks) - 1 else label
             place = round((x - low) / (high - low) * (self.columns - 1)) - len(label) // 2
             place = max(0, min(place, self.columns - len(text)))
-            if place + len(text) <= end:
-                axis[place : place + len(text)] = text
-                end = place - 1
-        return "".join(axis)
+            if place < len(axis) + bool(axis):
+                return None
+            axis = axis.ljust(place) + text
+        return axis
 
     def _place(self, x: float, y: float) -> tuple[float, float]:
         """Column and row of the dot; far points are clipped to just outside."""

@@ -86,8 +86,11 @@ class JointView:
 
     @property
     def status(self) -> Mapping[str, Any]:
-        """The joint's status message."""
-        return self._status
+        """The joint's status message; why no estimate is valid, only while none is."""
+        latest = self.history.latest
+        if latest is None or not latest.status & Status.VALID or "not_valid" not in self._status:
+            return self._status
+        return {**self._status, "not_valid": ""}
 
     @status.setter
     def status(self, status: Mapping[str, Any]) -> None:

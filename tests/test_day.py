@@ -24,6 +24,10 @@ from estimator.sample import Status
 BEGIN_S = datetime(2026, 1, 5, tzinfo=UTC).timestamp()
 
 
+SAID = """(() => { const said = [], canvas = CanvasRenderingContext2D.prototype, fill = canvas.fillText;
+canvas.fillText = text => said.push(text); dispatchEvent(new Event('resize')); canvas.fillText = fill; return said; })()"""
+
+
 class Written:
     """Rows of some seconds; every fifth of them with nothing valid."""
 
@@ -148,6 +152,7 @@ def test_the_page_of_a_short_day_can_be_read_on_a_phone(tmp_path):
             assert last > 250  # what was found has a line of its own
             assert browser.evaluate("document.querySelector('[aria-pressed=true]').textContent") == "10 min"
             assert browser.evaluate("text(5e-7, 5e-7)") == "5e−7"
+            assert "grey: not valid, red: event" in browser.evaluate(SAID)
             assert browser.evaluate("$('friction').shown.high") > 0.3 + 1.96 * 0.01  # its band is in the plot
     finally:
         web.close()

@@ -22,7 +22,7 @@ let n = 0; for (let i = 0; i < d.length; i += 4) if (d[i + 3] > 200 && d[i + 2] 
 return n > 100 ? n : 0; })()"""
 WIDE = "[...document.querySelectorAll('.numbers dl')].filter(d => d.scrollWidth > d.clientWidth).length"
 LONG = """(() => { $('externalbox').hidden = false; $('external').textContent = 'not valid';
-$('externalband').textContent = 'the residual is above the model\'s own baseline: the model is not sufficient';
+$('externalband').textContent = 'the residual is above its own baseline: the model is not sufficient';
 return document.documentElement.scrollWidth; })()"""
 SAVE = "HTMLAnchorElement.prototype.click = function() { saved = this.href; }; $('save').click()"
 

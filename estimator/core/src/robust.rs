@@ -10,7 +10,7 @@ mod zeros;
 use serde::{Deserialize, Serialize};
 
 use crate::align::{Alignment, Inputs, Positions};
-use crate::choices::{BRIDGED, LOOK_S, SAID_S, SETTLED};
+use crate::choices::{BRIDGED, LATEST, LOOK_S, SAID_S, SETTLED};
 use crate::corrections::Corrections;
 use crate::effects::MotorEffects;
 use crate::error::Error;
@@ -25,7 +25,7 @@ use crate::sample_validator::{Accepted, SampleValidator};
 use crate::settings::{Method, Priors, Settings};
 use crate::side::Side;
 use crate::signals::{Channel, Filters};
-use crate::suspicion::Suspicion;
+use crate::suspicion::{Reason, Suspicion};
 
 /// See the module.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -247,7 +247,7 @@ impl Robust {
         // Can it be used, and how far is it from the last one that was?
         let accepted = self.validator.check(sample);
         let late = std::mem::take(&mut self.live.late);
-        self.note(&accepted);
+        self.note(&accepted, late);
         if accepted.periods == 0 {
             return self.hold(sample.sequence, accepted.status);
         }
@@ -276,8 +276,10 @@ impl Robust {
     }
 
     /// What is wrong with a sample, and by how much it says that zeros have moved.
-    fn note(&mut self, accepted: &Accepted) {
-        self.live.refused = match (accepted.suspicion, self.live.refused) {
+    fn note(&mut self, accepted: &Accepted, late: f64) {
+        // A sample of about the next moment is ahead in all positions: none of them is wrong.
+        let another = |one: &Suspicion| one.reason == Reason::Jumped && late > LATEST * self.period;
+        self.live.refused = match (accepted.suspicion.filter(|one| !another(one)), self.live.refused) {
             (Some(now), _) => Some((now, self.said_periods)),
             (None, before) => before.map(|(was, left)| (was, left - 1)).filter(|(_, left)| *left > 0),
         };
@@ -316,3 +318,6 @@ impl Robust {
         Positions { link: if self.flexible { sample.link_position } else { 0.0 }, motor }
     }
 }
+
+#[cfg(test)]
+mod tests;

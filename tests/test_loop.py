@@ -104,6 +104,10 @@ def test_the_finding_says_what_since_when_and_the_error_before_and_after(frictio
     assert abs(value - 0.6) < 4.0 * std < 0.1
     assert found["error"]["after_rms_nm"] < 0.25 * found["error"]["before_rms_nm"]
     proposed = jointfile.load(proposal_file(friction))
+    origin = proposed.provenance["diagnosis"]  # which the views show once it is accepted
+    assert [origin[f"error_{when}_relative"] for when in ("before", "after")] == [
+        found["error"][f"{when}_relative"] for when in ("before", "after")
+    ]
     assert [one.name for one in proposed.motor[0].effect] == ["deflection_offset", "coulomb_friction"]
     assert {line.partition(":")[0] for line in found["parameters"]} == {
         "Coulomb friction (motor)",

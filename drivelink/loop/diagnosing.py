@@ -155,7 +155,8 @@ def make(recording: Path) -> dict[str, Any]:
         proposed = apply_diagnosis.diagnosed_model(source.joint, change)
         harmful = harm(model, proposed, [Unseen(part, held_from)], source.joint.estimator)
         if harmful is None:
-            apply_diagnosis.write(source, proposal_file(recording), change, part, recording.name, force=True)
+            shown = replace(change, validation=error)  # the views have one error before and after
+            apply_diagnosis.write(source, proposal_file(recording), shown, part, recording.name, force=True)
             state = finding.PROPOSED
     runs = simulated(held, declared=model, found=apply_diagnosis.diagnosed_model(source.joint, change))
     title = report.Title(source.joint.name, recording.name, None, source.joint.axis == "linear")

@@ -18,6 +18,7 @@ from drivelink.output import fitreport, plots, report, sentences
 from drivelink.output import motion as motions
 from drivelink.output.comparison import beside, fits, simulated
 from drivelink.output.document import Section, as_text, write
+from drivelink.plaintext import some
 from drivelink.recording.columns import parse_column_map
 from drivelink.runs import Paths, Runs, Warn, load
 from estimator.diagnosis import Diagnosis
@@ -117,9 +118,8 @@ class Fit:
         check_target(path, runs.paths, force=force)
         self._require_stiffness()
         if harmful := self._harm():
-            named = ", ".join(map(str, runs.paths))
             raise HarmfulModelError(
-                f"{named}: --write: {harmful}: nothing is written. "
+                f"{some(runs.paths)}: --write: {harmful}: nothing is written. "
                 "`drivelink diagnose` may say what is missing"
             )
         provenance = {
@@ -324,7 +324,7 @@ def fit(
     try:
         return Fit(runs, identify(list(runs.records), runs.source.joint.model(), bandwidth), bandwidth)
     except EstimatorError as error:
-        raise RecordingError(f"{', '.join(map(str, runs.paths))}: {error}") from error
+        raise RecordingError(f"{some(runs.paths)}: {error}") from error
 
 
 def diagnose(

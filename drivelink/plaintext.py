@@ -12,10 +12,13 @@ import sys
 import textwrap
 import time
 import unicodedata
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
+from itertools import accumulate
 from typing import TextIO
 
 MAX_TEXT = 4096  # characters of one text
+_SHOWN = 12  # of many names, at most
+_ROOM = 600  # characters for them: the rest of the message has to be read too
 # Control and format characters (direction, zero width), surrogates, private and unassigned ones.
 _UNSHOWABLE = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 
@@ -26,6 +29,13 @@ def clean_text(text: str, length: int = MAX_TEXT) -> str:
     if not text.isascii() or not text.isprintable():
         text = "".join(_shown(character) for character in text)
     return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def some(names: Iterable[object], length: int = _ROOM) -> str:
+    """Return the first of many names, each cut at so many characters, and how many there are."""
+    shown = [str(name)[:length] for name in names]
+    fit = sum(used <= _ROOM for used in accumulate(map(len, shown[:_SHOWN]))) or 1
+    return ", ".join(shown[:fit]) + (f", … ({len(shown)} in all)" if len(shown) > fit else "")
 
 
 def expected(name: str, known: Collection[str]) -> str:

@@ -11,6 +11,7 @@ from drivelink import recording
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointText
 from drivelink.output.numbers import Units
+from drivelink.plaintext import some
 from drivelink.recording.columns import parse_column_map
 from drivelink.recording.corrections import gate
 from drivelink.recording.mapping import joint_of
@@ -37,8 +38,8 @@ class Runs:
 
     @property
     def named(self) -> str:
-        """The same in one line."""
-        return ", ".join(self.names_of_files)
+        """The same in one line, of many some."""
+        return some(self.names_of_files)
 
     @property
     def units(self) -> Units:

@@ -17,6 +17,8 @@ import pytest
 
 from drivelink import jointfile, recording
 from drivelink.cli import main
+from drivelink.jointfile.document import MAX_LINE_BYTES
+from drivelink.runs import Runs
 from estimator import JointModel, LinkDynamics, Motor, Record, Transmission, fit
 from estimator.identify import identify
 
@@ -210,3 +212,19 @@ def test_two_recordings_of_a_robot_find_its_delay_and_one_stiffness(axis):
         assert abs(apart) < 1.96 * math.sqrt(both.covariance[0, 0] + alone.covariance[0, 0])
     assert both.stiffens
     assert all(one.validation is not None for one in found.recordings)
+
+
+def test_of_many_recordings_some_are_named_and_the_reason_is_said(tmp_path, capsys):
+    """The reason was cut off behind the names, and a joint file with all names in one line was not read again."""
+    (joint := tmp_path / "elbow.toml").write_text(JOINT)
+    paths = [tmp_path / f"{k:0120d}.csv" for k in range(60)]
+    for path in paths:
+        path.write_text(
+            "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad\n"
+            + "".join(f"{k * 1e-3},{k * 1e-3},1.0,{k * 1e-3}\n" for k in range(10))
+        )
+    assert main(["fit", *map(str, paths), "--joint", str(joint)]) == 3
+    said = capsys.readouterr().err
+    assert "… (60 in all): " in said and "too short" in said
+    runs = Runs(jointfile.load_text(joint), tuple(paths), (), ())
+    assert len(runs.named) < MAX_LINE_BYTES

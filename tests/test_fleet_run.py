@@ -23,11 +23,14 @@ import pytest
 
 pytest.importorskip("distributed", reason="the extra [fleet] is not installed")
 
+import dask
+from distributed import Client, LocalCluster, Security
+
 from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.fleet import runner, storage, task
 from drivelink.fleet.joints import Joints
-from drivelink.fleet.storage import Store
+from drivelink.fleet.storage import FleetError, Store
 from drivelink.fleet.table import read_rows
 from drivelink.fleet.task import HELD_OUT
 
@@ -86,9 +89,6 @@ def test_from_recordings_to_a_page(fleet, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_killed_worker_loses_nothing_and_doubles_nothing(fleet, tmp_path):
-    import dask
-    from distributed import Client, LocalCluster, Security
-
     secret, files = Security.temporary(), {}
     for name in ("ca-file", "client.cert", "client.key"):
         path = tmp_path / name
@@ -215,8 +215,40 @@ def test_what_a_user_gets_wrong_also_of_certificates_is_one_line(
     assert ("anybody who reaches it runs code" in error[0]) == ("--insecure" in arguments)
 
 
+def test_a_certificate_that_is_not_there_is_named(tmp_path):
+    files = {f"distributed.comm.tls.{name}": str(tmp_path / name) for name in ("ca-file", "client.cert")}
+    with dask.config.set(files), pytest.raises(FleetError, match=r"ca-file of Dask's .*: cannot be read"):
+        runner._remote("tls://127.0.0.1:1", False)
+
+
+def test_a_scheduler_without_workers_is_said_to_have_none(tmp_path):
+    """It waited in silence."""
+    secret, said, lines = Security.temporary(), [], []
+    (tmp_path / "r.csv").write_text("nothing")
+    sources, _ = storage.find([str(tmp_path / "r.csv")])
+    keys = {
+        "ca-file": secret.tls_ca_file,
+        "client.cert": secret.tls_client_cert,
+        "client.key": secret.tls_client_key,
+    }
+    settings = {f"distributed.comm.tls.{name}": value for name, value in keys.items()}
+    none = LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", security=secret)
+    with none as cluster, dask.config.set(settings):
+        address = cluster.scheduler_address
+
+        def say(line):
+            said.append(line)
+            cluster.scale(1)
+
+        joints = Joints.load(Path(runner.__file__).parents[1] / "joints")
+        runner.run(
+            sources, joints, Store(str(tmp_path)), runner.Settings(scheduler=address), lines.append, say
+        )
+    assert said[0] == f"--scheduler {address}: no worker has connected to it yet: waits for one"
+    assert len(lines) == 1
+
+
 def test_nobody_without_the_certificate_of_the_run_gets_into_the_local_cluster():
-    from distributed import Security
     from distributed.core import rpc
 
     async def called(address: str, security: Security | None) -> str:

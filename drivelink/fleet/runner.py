@@ -105,6 +105,8 @@ def run(
         if not wanted:
             return counts
         with _interruptible() as go_on, _client(settings, len(wanted)) as client:
+            if not client.scheduler_info(n_workers=-1)["workers"]:
+                say(f"--scheduler {settings.scheduler}: no worker has connected to it yet: waits for one")
             shared = client.submit(Joints, joints.by_name, pure=False)
             before = _previous(sources, joints, shared, client) if settings.validate == "previous" else {}
             tasks = (_task(source, before.get(source.url), table, settings) for source in wanted)
@@ -288,6 +290,9 @@ def _remote(address: str, insecure: bool) -> Client:
             f"--scheduler {address}: expected certificates in Dask's configuration: "
             "distributed.comm.tls.ca-file, .client.cert and .client.key"
         )
+    for file in (security.tls_ca_file, security.tls_client_cert, security.tls_client_key):
+        if file and "\n" not in file and not os.access(file, os.R_OK):  # else the certificate itself
+            raise FleetError(f"--scheduler {address}: {file} of Dask's configuration: cannot be read")
     try:
         return Client(address, security=security, timeout=f"{_CONNECT_S:g}s", set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from drivelink.errors import RecordingError, UsageError
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.columns import COLUMNS, OF_LINK, OF_MOTOR, si_factor
+from drivelink.plaintext import some
 from drivelink.recording.grid import (
     Grid,
     NotUniformError,
@@ -110,8 +111,6 @@ def renamed(
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_SHOWN = 12  # names in a message
-
 
 def sample_columns(motors: int) -> tuple[str, ...]:
     """Return the names of a sample's columns, in the order of `sample_row`."""
@@ -182,7 +181,7 @@ def record_from_columns(
     """
     columns = {**columns, **dict.fromkeys(ignored, np.empty(0))}
     if unknown := [name for name in columns if name not in COLUMNS]:
-        _LOG.warning("%s: ignored column(s) %s", where, _some(unknown))
+        _LOG.warning("%s: ignored column(s) %s", where, some(unknown, 40))
     columns = _scaled(columns, joint)
     motors = _motors(columns, joint, where)
     _require(columns, "time_s", where)
@@ -373,11 +372,5 @@ def _require(columns: Mapping[str, FloatArray], name: str, where: str, other: st
     if name not in columns:
         near = difflib.get_close_matches(name, set(columns) - COLUMNS, n=1, cutoff=0.75)
         hint = f"; did you mean it by {near[0]}?" if near else ""
-        found = _some(list(columns)) or "none"
+        found = some(columns, 40) or "none"
         raise RecordingError(f"{where}: expected a column {name}{other}, found {found}{hint}")
-
-
-def _some(names: Sequence[str]) -> str:
-    """Some names, for a message."""
-    more = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
-    return ", ".join(name[:40] for name in names[:_SHOWN]) + more

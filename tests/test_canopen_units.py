@@ -159,6 +159,24 @@ def test_a_wrong_object_is_one_line(text):
 
 
 @pytest.mark.parametrize(
+    ("address", "signal"),
+    [
+        ((0x608F, 1), Signal.MOTOR_POSITION),
+        ((0x6501, 0), Signal.LINK_POSITION),
+        ((0x6076, 0), Signal.MOTOR_TORQUE),
+    ],
+)
+def test_a_unit_of_an_erased_memory_is_not_known(address, signal):
+    """An encoder of 4294967295 counts was one that never moves: half of the stiffness was missing, valid."""
+    text = joint_text(link='[link.encoder]\nsource = "cia406"\nnode_id = 9')
+    told = {(0x608F, 1): 4096, (0x608F, 2): 1, (0x6501, 0): 4096, (0x6076, 0): 1000, address: 0xFFFFFFFF}
+    found = [offer(role, told, GENERIC) for role in roles(parse(text))]
+    assert [one for one in found if signal in one.missing] and not [
+        one for one in found if signal in one.candidates
+    ]
+
+
+@pytest.mark.parametrize(
     ("reported", "counts", "modulus"),
     [
         ({(0x6501, 0): 8192}, 8192, 0),  # revolutions unknown: the full length

@@ -25,6 +25,7 @@ _DRIVE_OBJECTS: tuple[Address, ...] = (
 _ENCODER_OBJECTS: tuple[Address, ...] = ((0x6000, 0), (0x6001, 0), (0x6002, 0), (0x6501, 0), (0x6502, 0))
 _SCALING = 1 << 2  # of 0x6000, CiA 406: counts per revolution are those of 0x6001
 
+_ERASED = 0xFFFF_FFFF  # of a unit that was never set; as an encoder's range it is that of its word
 _SAME = 1e-3  # relative; tables in data sheets are rounded to about that
 _MICRO_FROM = 20_000  # 0x6076 of a maker that uses µN·m and mN·m but has no motor of 20 N·m
 
@@ -53,6 +54,7 @@ def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
         role: role of the node, with its section of the joint file.
     """
     result = Offer()
+    reported = {address: value for address, value in reported.items() if value != _ERASED}
     vendor = vendor.generation(reported)
     if role.drive is not None:
         _Drive(role, role.drive, reported, vendor, result).offer()
@@ -386,6 +388,6 @@ def _offer_link(role: Role, encoder: EncoderSection, reported: Mapping[Address, 
 def _measuring_range(reported: Mapping[Address, int]) -> int:
     """Counts after which an absolute encoder rolls over (CiA 406); 0: at its full length."""
     range_ = reported.get((0x6002, 0), 0)
-    if range_ in (0, 0xFFFFFFFF):  # not reported, or the full 32 bits
+    if not range_:  # not reported, or the full 32 bits
         range_ = reported.get((0x6501, 0), 0) * reported.get((0x6502, 0), 0)
     return range_ if 1 < range_ < 1 << 32 else 0

@@ -326,11 +326,11 @@ def _effects(joint: dict[str, Any]) -> list[Grid]:
                 spaced(effect["location"]),
                 f"{effect['recordings']} of {effect['of']} recordings",
                 f"since {effect['since'][:10]}" + (" (significant)" if effect["significant"] else ""),
-                f"{before} → {after} % of the torque",
+                f"{before} → {after} % of the torque (median)",
                 Markup(_link(effect["report"], "diagnosis")),
             )
         )
-    return [Grid(("found", "at", "in", "", "error without → with it, median", ""), rows)] if rows else []
+    return [Grid(("found", "at", "in", "", "error without → with it", ""), rows)] if rows else []
 
 
 def _diagnoses(joint: dict[str, Any]) -> str:

@@ -228,6 +228,45 @@ class McapMessages:
     def __iter__(self) -> McapMessages: ...
     def __next__(self) -> McapMessage: ...
 
+class SdoTransfers:
+    """Follows the SDO channel of one node; see `drivelink.canopen.sdo_sniffer`.
+
+    Args:
+        interesting: whether to keep the value of an object (index, subindex).
+
+    Attributes:
+        values: confirmed unsigned values by (index, subindex).
+        written: those of them that were written, not read.
+        disputed: objects with two different answers to one request, or a download that was given up.
+        changes: number of new, changed, forgotten and disputed values.
+    """
+
+    changes: int
+
+    def __init__(self, interesting: Callable[[int, int], bool], timeout_s: float) -> None: ...
+    @property
+    def values(self) -> dict[tuple[int, int], int]: ...
+    @property
+    def written(self) -> set[tuple[int, int]]: ...
+    @property
+    def disputed(self) -> set[tuple[int, int]]: ...
+    @property
+    def unasked(self) -> int:
+        """Answers that belong to no request."""
+
+    @property
+    def pending(self) -> tuple[int, int] | None:
+        """The object being written, not yet confirmed."""
+
+    def drop_transfer(self) -> None:
+        """Forget the present transfer."""
+
+    def request(self, data: bytes, now_s: float) -> None:
+        """Process a frame of the master, 0x600 + node."""
+
+    def response(self, data: bytes, now_s: float) -> tuple[tuple[int, int], bytes] | None:
+        """Process a frame of the node, 0x580 + node; return the object of interest that it ends to read."""
+
 class SyncNumbering:
     """Numbers the SYNCs of a stream once enough others have followed.
 

@@ -177,7 +177,8 @@ class FrameLog:
                     break
             elif can_id in (OF_MAPS if self._passive else OF_SDO) and (listener.busy or not self._passive):
                 now_s = seconds(stamp_ns, len(syncs), listener.bus.period_s)
-                listener.feed(can_id, data, now_s)
+                if not listener.feed(can_id, data, now_s):
+                    continue
                 changed = listener.poll(now_s)
                 self._require_few_mappings()
                 if changed:

@@ -16,4 +16,5 @@ pub mod numbering;
 pub mod pipeline;
 #[cfg(feature = "python")]
 pub mod python;
+pub mod sdo;
 pub mod wire;

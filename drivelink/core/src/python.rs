@@ -5,6 +5,7 @@ mod latency;
 mod mcap;
 mod numbering;
 mod pipeline;
+mod sdo;
 mod tick;
 mod values;
 
@@ -43,6 +44,8 @@ mod extension {
     use super::numbering::SyncNumbering;
     #[pymodule_export]
     use super::pipeline::JointPipeline;
+    #[pymodule_export]
+    use super::sdo::SdoTransfers;
     #[pymodule_export]
     use super::tick::{History, Tick};
     #[pymodule_export]

@@ -157,12 +157,24 @@ def test_the_torque_of_a_straight_line_is_not_valid_where_its_zero_or_the_torque
 
 @pytest.mark.parametrize(
     ("name", "seed", "off_rad"),
-    [("constant", 1, 0.0258), ("constant", 4, 0.1641), ("quadratic", 5, -0.3109), ("quadratic", 5, -3.5073)],
+    [
+        *(
+            ("constant", 1, 0.0258),
+            ("constant", 4, 0.1641),
+            ("quadratic", 5, -0.3109),
+            ("quadratic", 5, -3.5073),
+        ),
+        *(("vsa-ii", 0, 0.7), ("vsa-ii", 2, -1.1)),
+    ],
 )
 def test_a_constant_torque_that_may_be_the_zero_s_is_not_believed_from_the_start(name, seed, off_rad):
-    """Of a line, beside effects that bend the curve, and where the balance is linearised far from the zero."""
+    """Of a line, beside effects that bend the curve, far from the zero, by few rows, and beyond where a law ends."""
     moved = kit.motion(name, 12.0, seed=seed)
-    samples = [s._replace(motor_position_rad=(s.motor_position_rad[0] + off_rad,)) for s in moved.samples]
+    own = [s.motor_position_rad for s in moved.samples]
+    samples = [
+        s._replace(motor_position_rad=(o[0] + off_rad, *o[1:]))
+        for s, o in zip(moved.samples, own, strict=True)
+    ]
     estimates, _ = kit.play(kit.declared(name), samples)
     assert not np.any(kit.wrong(estimates, moved.stiffness_nm_rad))
     assert not np.any(kit.wrong_torque(estimates, moved.torque_nm))

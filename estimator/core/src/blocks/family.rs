@@ -2,7 +2,7 @@
 
 use super::Blocks;
 use crate::balance::Balance;
-use crate::choices::{EXACT, FEWEST, MARGIN, REACHED};
+use crate::choices::{EXACT, FEWEST, MARGIN, REACHED, SURE};
 use crate::gram::{Gram, Row, set};
 use crate::laws::Law;
 use crate::spring::{Family, NODES, Projection};
@@ -68,9 +68,10 @@ impl Blocks {
             return false;
         }
         self.fit_projection();
-        let known = self.posterior.is_some() && (self.ring.len() >= FEWEST || self.spring.is_anchored());
         let possible = self.is_shaped() && self.seen[1].max(-self.seen[0]) < REACHED * self.spring.reach();
-        let Some(projection) = self.projection.as_ref().filter(|_| known && possible) else { return false };
+        let known =
+            possible && self.is_shape_known() && (self.ring.len() >= FEWEST || self.spring.is_anchored());
+        let Some(projection) = self.projection.as_ref().filter(|_| known) else { return false };
         if self.is_held(projection) {
             return false;
         }
@@ -88,6 +89,16 @@ impl Blocks {
     /// Whether no sum of few powers is the law, and functions near it are quickly had.
     fn is_shaped(&self) -> bool {
         matches!(self.spring.law, Law::VsaII | Law::Exponential)
+    }
+
+    /// Whether the law that explains the rows has this shape, and no other.
+    fn is_shape_known(&self) -> bool {
+        let (shape, least) = (SPRING.start + 1, self.spring.law.shapes()[0].low);
+        let known =
+            self.posterior.as_ref().filter(|known| known.set >> shape & 1 == 1 && self.is_explained());
+        known.is_some_and(|known| {
+            self.spring.parameters()[1] - least > SURE * known.covariance[shape][shape].sqrt()
+        })
     }
 
     /// Whether the sum of the functions is the law where it is fitted.

@@ -66,14 +66,15 @@ impl Blocks {
         self.posterior.as_ref().map_or(0.0, |known| known.covariance[ZERO][ZERO].sqrt())
     }
 
-    /// The constant torque that is the zero's or the reading's where nothing tells which, N·m: by a straight line, or beside
-    /// effects that bend the curve as another zero would; 0: a lost zero, or a curve that is the declared one.
+    /// The constant torque that is the zero's or the reading's where nothing tells which, N·m: by a straight line, beside
+    /// effects that bend the curve as another zero would, or by few rows; 0: a lost zero, or a curve that is the declared one.
     #[must_use]
     pub fn zero_torque(&self, stiffness: f64) -> f64 {
         let Some(known) = self.posterior.as_ref().filter(|_| !self.lost) else { return 0.0 };
         let bending = set(STOPS) | set(CLIPS) | set(CORNER) | set(ASYMMETRY);
         let straight = self.spring.is_constant() && !self.moved;
-        if !straight && known.set & bending == 0 && !self.spring.is_longer(known.set) {
+        let told = known.set & bending == 0 && !self.spring.is_longer(known.set) && !self.are_few();
+        if !straight && told {
             return 0.0;
         }
         known.x[OFFSET].abs().max(if self.moved { (stiffness * self.spring.zero).abs() } else { 0.0 })
@@ -91,9 +92,14 @@ impl Blocks {
         carried.map_or(f64::INFINITY, |carried| carried.unexplained)
     }
 
-    /// Whether the balance leaves less than a useful estimate may, and about what it left before a change.
+    /// Whether the balance leaves less than a useful estimate may, and about what it left before a change, by a law that
+    /// reaches as far as the deflections that it was learned from.
     #[must_use]
     pub fn is_explained(&self) -> bool {
+        let ([low, high], zero) = (self.seen, self.spring.zero);
+        if low < high && (low + zero).abs().max((high + zero).abs()) >= self.spring.reach() {
+            return false;
+        }
         let usual = self.usual_unexplained().max((self.readings.white / self.fluctuation).sqrt());
         self.unexplained < USEFUL && self.unexplained <= UNUSUAL.sqrt() * usual
     }

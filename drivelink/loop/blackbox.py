@@ -255,11 +255,13 @@ class BlackBox(Sink):
             unfinished.replace(path)
             drop_oldest(self._folder, self._text.joint.name, self._section.keep_mib)
         except (OSError, RecordingError) as error:
-            _LOG.error("%s: %s is not kept: %s", self._text.joint.name, event.cause, error)
+            cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
+            why = f"{path}: nothing is kept: {getattr(cause, 'strerror', None) or cause}"
+            _LOG.error("%s: %s: %s", self._text.joint.name, event.cause, why)
             if sink is not None:
                 sink.abandon()
                 unfinished.unlink(missing_ok=True)
-            self._answer(event, str(error))
+            self._answer(event, why)
             return
         finally:
             if lock is not None:

@@ -53,6 +53,7 @@ class Case(NamedTuple):
     order: int | None = 2
     off: tuple[float, float] | None = None  # declared parameters over the true ones; None: none are
     stiff: bool = False
+    soft: float = 1.0  # times the spring: it is bent as much further
     pull: float = 0.0  # on the link, over the motion's torque: the deflection stays on one side
     more: Mapping[str, float | str] = {}
 
@@ -69,8 +70,10 @@ CASES = {
     "vsa-ii declared right": Case("vsa-ii", "vsa-ii", None, (1.0, 1.0)),
     "vsa-ii declared 20 % off": Case("vsa-ii", "vsa-ii", None, OFF),
     "vsa-ii as a polynomial of 3": Case("vsa-ii", "polynomial", 3),
+    "vsa-ii near its end": Case("vsa-ii", "vsa-ii", None, soft=0.06),
     "exponential from nothing": Case("exponential", "exponential", None),
     "exponential declared 20 % off": Case("exponential", "exponential", None, OFF),
+    "steep exponential": Case("exponential", "exponential", None, soft=0.03),
     "exponential as unknown": Case("exponential", "unknown", None),
     "exponential as unknown, on one side": Case("exponential", "unknown", None, pull=1.5),
     "vsa-ii as unknown, on one side": Case("vsa-ii", "unknown", None, pull=1.5),
@@ -164,7 +167,7 @@ def drawn(case: Case, effect: str, seed: int, seconds: float, motion: str) -> Dr
     if case.spring in SHAPES:
         setting, name, low, span = SHAPES[case.spring]
         shape = rng.uniform(*span)
-        k = rng.uniform(300.0, 700.0) if case.spring == "vsa-ii" else stiffness
+        k = case.soft * (rng.uniform(300.0, 700.0) if case.spring == "vsa-ii" else stiffness)
         settings |= {"stiffness": k, setting: shape}
         if case.off is not None:
             parameters = {"k_nm_rad": case.off[0] * k, name: low + case.off[1] * (shape - low)}

@@ -20,6 +20,9 @@ impl Blocks {
         self.powers = self.family.powers();
         if !self.ring.is_empty() {
             self.solve();
+        } else if self.frame.is_some() {
+            self.fit_projection();
+            self.restate();
         }
     }
 
@@ -136,11 +139,12 @@ impl Blocks {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::balance;
+    use crate::gram::{COLUMNS, Posterior, UNKNOWNS, dot};
     use crate::model::{Motor, Transmission};
     use crate::settings::Priors;
 
-    #[test]
-    fn a_law_is_known_where_the_joint_is_however_large_a_deflection_has_seemed() {
+    fn declared() -> Blocks {
         let transmission = Transmission::Elastic {
             law: Law::VsaII,
             order: None,
@@ -148,9 +152,39 @@ mod tests {
             covariance: None,
         };
         let motor = Motor::bare(5e-4, 5e-3, transmission);
+        Blocks::new(&motor, &Priors::USUAL, 1e-3, 100.0, 75, 1.0)
+    }
+
+    #[test]
+    fn what_is_known_grows_with_the_columns_before_any_block_too() {
+        let (mut blocks, mut balance) = (declared(), Balance::new(Family::Near(Law::VsaII, 1.7)));
+        balance.grow(0.6);
+        blocks.family = balance.family.clone();
+        blocks.grow(&[1.0; COLUMNS], &balance);
+        blocks.seen = [-0.7, 0.9];
+        let covariance = [[0.0; UNKNOWNS]; UNKNOWNS];
+        blocks.posterior = Some(Posterior { set: 0, x: [0.0; UNKNOWNS], covariance, log_evidence: 0.0 });
+        blocks.fit_projection();
+        blocks.restate();
+        let row = |size: f64| {
+            let (mut row, columns) = ([0.0; COLUMNS], balance::SPRING.start..balance::SLOPE.end);
+            row[balance::TORQUE] = 0.5;
+            let terms = Family::Near(Law::VsaII, 1.7).at(0.8 / size, size);
+            row[columns].iter_mut().zip(terms).for_each(|(value, term)| *value = -term);
+            row
+        };
+        let before = dot(&row(0.6), &blocks.residual);
+        let factors = balance.grow(0.9);
+        blocks.grow(&factors, &balance);
+        assert!(before.abs() > 0.1);
+        assert!((dot(&row(0.9), &blocks.residual) - before).abs() < EXACT * before.abs());
+    }
+
+    #[test]
+    fn a_law_is_known_where_the_joint_is_however_large_a_deflection_has_seemed() {
         let [low, high] = [-0.6, 0.15]; // it ends at 1.2 rad
         for size in [1.8, 1.05] {
-            let mut blocks = Blocks::new(&motor, &Priors::USUAL, 1e-3, 100.0, 75, 1.0);
+            let mut blocks = declared();
             (blocks.deflection, blocks.seen, blocks.spring.zero) = (size, [low, high], 0.05);
             let off = |blocks: &Blocks| {
                 let curve = blocks.spring.torque(blocks.projection.as_ref().unwrap());

@@ -66,6 +66,21 @@ def test_a_vsa_near_the_end_of_its_linkage_is_as_stiff_as_it_is_and_nothing_else
     assert not np.any(estimates.status & int(Status.CHANGED))
 
 
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [("transmission_damping", {"damping_nm_s_rad": 0.002}), ("hysteresis", {"torque_nm": 0.015})],
+)
+def test_what_nobody_declared_is_named_near_the_end_of_the_linkage_too(name, parameters):
+    large = dict(case("vsa-ii").rich, amplitude_nm=0.3)
+    motion = kit.motion("vsa-ii", 16.0, seed=9, excitation=large, effects=(make(name, parameters, 0),))
+    estimates, estimator = kit.play(kit.declared("vsa-ii"), motion.samples)
+    off = np.abs(estimates.stiffness_nm_rad / motion.stiffness_nm_rad - 1.0)[-8000:]
+    assert name in estimator.undeclared()[0] and not estimator.undeclared()[1]
+    assert np.all(estimates.valid[-8000:])
+    assert np.median(off) < 0.005  # hysteresis is of another law than ours
+    assert not np.any(estimates.status & int(Status.CHANGED))
+
+
 def test_a_spring_of_another_stiffness_on_either_side_is_named_and_right():
     def stiffness(phi):
         return np.where(phi > 0.0, 195.0, 105.0)

@@ -48,11 +48,13 @@ pub const SINE: std::ops::Range<usize> = 32..34;
 pub const COSINE: std::ops::Range<usize> = 34..36;
 /// The torque's second derivative, N·m/s²: one that is read late by much.
 pub const TORQUE_SECOND: usize = 36;
+/// −q′: with θ′ the rate of the deflection, for a damping of the transmission.
+pub const LINK_RATE: usize = 37;
 
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
 const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len() + 2; // columns that are functions of the raw φ
-const FORMED: usize = 15; // columns of lightly filtered signals: dry, soft, load ×2, late ×2, read ×2, stops ×3, sine ×2, cosine ×2
+const FORMED: usize = 16; // columns of lightly filtered signals: dry, soft, load ×2, late ×2, read ×2, stops ×3, sine ×2, cosine ×2, q′
 
 /// What the columns are scaled by, taken from the motion.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -225,7 +227,7 @@ impl Balance {
         self.light.scale(&curve);
         self.curve.scale(&curve);
         let [a, b] = [terms[TERMS], terms[TERMS + 1]];
-        self.formed.scale(&[1.0, 1.0, terms[0], terms[1], a, b, a, b, 1.0, 1.0, 1.0, a, b, a, b]);
+        self.formed.scale(&[1.0, 1.0, terms[0], terms[1], a, b, a, b, 1.0, 1.0, 1.0, a, b, a, b, 1.0]);
         factors
     }
 
@@ -268,9 +270,10 @@ impl Balance {
         let (sine, cosine) = q.sin_cos();
         self.waves = [sine, cosine];
         let link = [q_rate, q, sine, cosine].map(|signal| [-first * signal, -second * signal]);
-        let mut now = [sign, soft, load[0], load[1], 0.0, 0.0, 0.0, 0.0, -a, -b, -c, 0.0, 0.0, 0.0, 0.0];
+        let mut now =
+            [sign, soft, load[0], load[1], 0.0, 0.0, 0.0, 0.0, -a, -b, -c, 0.0, 0.0, 0.0, 0.0, -q_rate];
         now[4..8].copy_from_slice(link[..2].as_flattened());
-        now[11..].copy_from_slice(link[2..].as_flattened());
+        now[11..15].copy_from_slice(link[2..].as_flattened());
         self.formed.smooth(&filters.main, now);
     }
 
@@ -289,7 +292,7 @@ impl Balance {
         (row[UNEVEN], row[CORNER]) = (curve[CURVE - 2], curve[CURVE - 1]);
         let formed = &self.formed.state[0];
         let places = [DRY, SOFT, LOAD[0], LOAD[1]];
-        let ranges = LATE.chain(READ).chain(STOPS).chain(SINE).chain(COSINE);
+        let ranges = LATE.chain(READ).chain(STOPS).chain(SINE).chain(COSINE).chain([LINK_RATE]);
         for (column, value) in places.into_iter().chain(ranges).zip(formed) {
             row[column] = *value;
         }

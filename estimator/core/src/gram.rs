@@ -15,7 +15,7 @@ use cholesky::Cholesky;
 pub use frame::{Frame, Reduced};
 
 /// Columns of a row.
-pub const COLUMNS: usize = 37;
+pub const COLUMNS: usize = 38;
 
 /// One value a column.
 pub type Row = [f64; COLUMNS];

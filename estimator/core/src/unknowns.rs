@@ -303,7 +303,7 @@ impl Spring {
             (DRY, balance::DRY),
             (SOFT, balance::SOFT),
             (RATE, balance::VELOCITY),
-            (RATE, balance::LATE.start), // −q′
+            (RATE, balance::LINK_RATE),
             (ASYMMETRY.start, balance::UNEVEN),
             (CORNER.start, balance::CORNER),
         ];

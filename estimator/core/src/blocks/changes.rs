@@ -124,7 +124,7 @@ impl Blocks {
 
     /// What is known begins with the window: the unknowns that have changed are open again, the others are as before.
     pub(super) fn restart(&mut self, opens: Set) {
-        self.carry_over(opens);
+        self.carry_over(opens | set(CORNER.start..ASYMMETRY.end)); // they are of one size
         self.ring.clear();
         self.peaks.clear();
         self.oldest = 0;
@@ -143,7 +143,7 @@ impl Blocks {
 
     pub(super) fn carry_over(&mut self, opens: Set) {
         let Some(posterior) = &self.posterior else { return };
-        let kept = posterior.set & !opens & !set(CORNER.start..ASYMMETRY.end); // they are of one size
+        let kept = posterior.set & !opens;
         let mut x = posterior.x;
         for (i, unknown) in SPRING.enumerate() {
             x[unknown] = self.spring.alpha[i];
@@ -173,7 +173,7 @@ impl Blocks {
             // What was learned without a zero may be of another one: as it was before.
             self.spring.alpha[..TERMS].copy_from_slice(&carried.x[SPRING]);
         } else {
-            self.carry_over(1 << ZERO);
+            self.carry_over(1 << ZERO | set(CORNER.start..ASYMMETRY.end));
         }
         let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
         self.forget_rows();

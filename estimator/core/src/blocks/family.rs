@@ -2,11 +2,11 @@
 
 use super::Blocks;
 use crate::balance::Balance;
-use crate::choices::{EXACT, FEWEST, MARGIN, REACHED, SURE};
+use crate::choices::{EXACT, MARGIN, REACHED, SURE};
 use crate::gram::{Gram, Row, set};
 use crate::laws::Law;
 use crate::spring::{Family, NODES, Projection};
-use crate::unknowns::{SPRING, ZERO};
+use crate::unknowns::{CORNER, SPRING, ZERO};
 
 impl Blocks {
     /// The spring's columns have grown by these factors.
@@ -72,15 +72,18 @@ impl Blocks {
         }
         self.fit_projection();
         let possible = self.is_shaped() && self.seen[1].max(-self.seen[0]) < REACHED * self.spring.reach();
-        let known =
-            possible && self.is_shape_known() && (self.ring.len() >= FEWEST || self.spring.is_anchored());
+        let known = possible && self.is_shape_known() && !self.are_few();
         let Some(projection) = self.projection.as_ref().filter(|_| known) else { return false };
         if self.is_held(projection) {
             return false;
         }
         self.family = Family::Near(self.spring.law.clone(), self.spring.parameters()[1]);
         self.powers = self.family.powers();
-        self.carry_over(set(SPRING) | 1 << ZERO);
+        let usual = self.usual_unexplained();
+        self.carry_over(set(SPRING) | set(CORNER) | 1 << ZERO);
+        if let Some(carried) = &mut self.carried {
+            carried.unexplained = usual; // the joint is as it was, but goes further: it may leave more
+        }
         self.ring.clear();
         self.peaks.clear();
         (self.oldest, self.open, self.skipped) = (0, Gram::default(), self.settle);

@@ -67,14 +67,14 @@ impl Blocks {
     }
 
     /// The constant torque that is the zero's or the reading's where nothing tells which, N·m: by a straight line, beside
-    /// effects that bend the curve as another zero would, by few rows, or on one side of a law of which nothing is declared;
+    /// effects that bend the curve as another zero would, by few rows, or on one side of a law whose shape nobody declared;
     /// 0: a lost zero, or a curve that is the declared one.
     #[must_use]
     pub fn zero_torque(&self, stiffness: f64) -> f64 {
         let Some(known) = self.posterior.as_ref().filter(|_| !self.lost) else { return 0.0 };
         let bending = set(STOPS) | set(CLIPS) | set(CORNER) | set(ASYMMETRY);
         let straight = self.spring.is_constant() && !self.moved;
-        let both_sides = self.spring.is_anchored() || self.seen[0] < 0.0 && 0.0 < self.seen[1];
+        let both_sides = !self.spring.is_searched() || self.seen[0] < 0.0 && 0.0 < self.seen[1];
         let bends = known.set & bending != 0 || self.spring.is_longer(known.set);
         let told = both_sides && !bends && !self.are_few();
         if !straight && told {

@@ -67,8 +67,8 @@ impl Blocks {
     }
 
     /// The constant torque that is the zero's or the reading's where nothing tells which, N·m: by a straight line, beside
-    /// effects that bend the curve as another zero would, by few rows, or on one side of a law whose shape nobody declared;
-    /// 0: a lost zero, or a curve that is the declared one.
+    /// effects that bend the curve as another zero would, by few rows and none before, or on one side of a law whose
+    /// shape nobody declared; 0: a lost zero, or a curve that is the declared one.
     #[must_use]
     pub fn zero_torque(&self, stiffness: f64) -> f64 {
         let Some(known) = self.posterior.as_ref().filter(|_| !self.lost) else { return 0.0 };
@@ -76,7 +76,8 @@ impl Blocks {
         let straight = self.spring.is_constant() && !self.moved;
         let both_sides = !self.spring.is_searched() || self.seen[0] < 0.0 && 0.0 < self.seen[1];
         let bends = known.set & bending != 0 || self.spring.is_longer(known.set);
-        let told = both_sides && !bends && !self.are_few();
+        let before = self.carried.as_ref().is_some_and(|carried| carried.set >> ZERO & 1 == 1);
+        let told = both_sides && !bends && (before || !self.are_few());
         if !straight && told {
             return 0.0;
         }

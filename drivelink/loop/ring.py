@@ -1,4 +1,4 @@
-"""The newest items of a black box, packed second by second: as objects they take ten times the memory."""
+"""The newest items of a black box, packed second by second: objects take ten times the memory and more."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, TAILS, 
 use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse};
 use crate::model::Motor;
 use crate::settings::Priors;
-use crate::spring::{Family, Projection, TERMS};
+use crate::spring::{Family, Projection};
 use crate::student::f_quantile;
 use crate::unknowns::{ACTIVE, DRY, Spring};
 
@@ -93,7 +93,6 @@ pub struct Blocks {
     settle: u32,
     fitted: bool, // what the file knows has been held against a block
     lost: bool,   // the zero: it may be anywhere, but for what motion shows
-    powers: [f64; TERMS],
     frame: Option<Frame>,
     #[serde(with = "crate::snapshot::array")]
     residual: Row,
@@ -163,7 +162,6 @@ impl Blocks {
             settle,
             fitted: false,
             lost: false,
-            powers: [1.0; TERMS],
             frame: None,
             residual: [0.0; crate::gram::COLUMNS],
             odds: None,
@@ -350,8 +348,7 @@ impl Blocks {
     fn believe(&mut self, block: &Gram) {
         let Some(projection) = self.projection.clone() else { return };
         let frame = self.spring.frame(&projection);
-        let near = self.priors.deflection_offset * self.deflection + self.readings.resolution;
-        let prior = self.prior(block, &frame, near);
+        let prior = self.prior(block, &frame, self.near());
         let known = frame.set & ACTIVE;
         let covariance = inverse(&prior.precision, known);
         self.noise.variance = self.early(block);

@@ -114,8 +114,8 @@ pub struct Known<'a> {
     pub torque: &'a Coefficients,
     /// The same of the stiffness.
     pub slope: &'a Coefficients,
-    /// Powers of u that the family's functions are.
-    pub powers: [f64; TERMS],
+    /// The same of φ σ.
+    pub turn: &'a Coefficients,
     /// B and D.
     pub motor: (f64, f64),
     /// rms of the torque, N·m.
@@ -238,12 +238,10 @@ impl Known<'_> {
         factor
     }
 
-    /// θ reads (1 + a) θ; σ θ = σ q − σ φ, and σ φ is the torque of a spring of these powers.
+    /// θ reads (1 + a) θ; σ θ = σ q − σ φ.
     fn add_motor_scale(&self, v: &mut Row) -> f64 {
         (v[ACCELERATION], v[VELOCITY]) = (-self.motor.0, -self.motor.1);
-        for (k, c) in self.slope[TERMS..].iter().enumerate() {
-            v[SPRING.start + k] -= c * self.deflection * self.powers[k];
-        }
+        self.add_spring(v, self.turn, -1.0);
         self.add_slope(v, READ.start, 1.0)
     }
 

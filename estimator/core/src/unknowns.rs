@@ -367,6 +367,12 @@ impl Spring {
         (rows.quadratic(&direction) / rows.rows - mean * mean).max(0.0).sqrt()
     }
 
+    /// φ σ as a sum of the family's functions.
+    #[must_use]
+    pub fn turn(&self, projection: &Projection) -> Coefficients {
+        projection.of(|phi| phi * self.curve(phi).1)
+    }
+
     /// σ as a sum of the family's functions.
     #[must_use]
     pub fn slope(&self, projection: &Projection) -> Coefficients {

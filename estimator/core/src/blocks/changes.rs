@@ -74,7 +74,7 @@ impl Blocks {
             precision: &inverse(&posterior.covariance, posterior.set),
             torque: &self.spring.torque(projection),
             slope: &self.spring.slope(projection),
-            powers: self.powers,
+            turn: &self.spring.turn(projection),
             motor: (posterior.x[INERTIA], posterior.x[DAMPING]),
             torque_rms: balance::variance(rows, balance::TORQUE).sqrt(),
             deflection: self.deflection,

@@ -17,7 +17,6 @@ impl Blocks {
         self.deflection = balance.size.deflection;
         let reach = REACHED * self.spring.widest_reach(self.deflection);
         self.projection = Some(Projection::new(&self.family, self.deflection, reach));
-        self.powers = self.family.powers();
         if !self.ring.is_empty() {
             self.solve();
         } else if self.frame.is_some() {
@@ -78,7 +77,6 @@ impl Blocks {
             return false;
         }
         self.family = Family::Near(self.spring.law.clone(), self.spring.parameters()[1]);
-        self.powers = self.family.powers();
         let usual = self.usual_unexplained();
         self.carry_over(set(SPRING) | set(CORNER) | 1 << ZERO);
         if let Some(carried) = &mut self.carried {
@@ -134,7 +132,7 @@ impl Blocks {
     pub(super) fn unform(&mut self) {
         if self.is_shaped() && matches!(self.family, Family::Near(..)) {
             self.family = Family::of(Some(&self.spring.law));
-            (self.powers, self.skipped) = (self.family.powers(), self.settle);
+            self.skipped = self.settle;
         }
     }
 }
@@ -181,6 +179,17 @@ mod tests {
         blocks.grow(&factors, &balance);
         assert!(before.abs() > 0.1);
         assert!((dot(&row(0.9), &blocks.residual) - before).abs() < EXACT * before.abs());
+    }
+
+    #[test]
+    fn what_a_scale_makes_of_the_torque_is_a_sum_of_functions_near_a_law() {
+        let (spring, family, size) = (declared().spring, Family::Near(Law::VsaII, 1.74), 0.9);
+        let turn = spring.turn(&Projection::new(&family, size, f64::INFINITY));
+        let most = size * spring.curve(size).1;
+        for phi in [-0.85, -0.3, 0.1, 0.6, 0.9] {
+            let sum: f64 = family.at(phi / size, size).iter().zip(&turn).map(|(b, a)| b * a).sum();
+            assert!((sum - phi * spring.curve(phi).1).abs() < 0.01 * most, "{sum} at {phi}");
+        }
     }
 
     #[test]

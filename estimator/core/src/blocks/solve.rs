@@ -163,8 +163,7 @@ impl Blocks {
         }
         self.fit_projection();
         let Some(projection) = self.projection.clone() else { return };
-        let near = self.priors.deflection_offset * self.deflection + self.readings.resolution;
-        let zero = if self.lost { self.deflection } else { near };
+        let zero = if self.lost { self.deflection } else { self.near() };
         let of_columns = self.noise_of_columns(&total);
         for step in 0..STEPS {
             let frame = self.spring.frame(&projection);
@@ -179,15 +178,11 @@ impl Blocks {
                 return;
             };
             let used = if moved { self.prior(&total, &frame, self.deflection) } else { prior };
-            let own = total.quadratic(&frame.residual(&chosen.x, chosen.set)) / total.rows;
-            self.own = own.sqrt().max(EXACT * total.rms(balance::TORQUE));
-            let usual = self.motor.fit_rms.map_or(0.0, |(_, torque)| torque); // little motion is no worse model
-            (self.fluctuation, self.unexplained) = (torque, self.own / torque.sqrt().max(usual));
+            let own = self.leave(&frame, &chosen, &total, torque);
             let far = SPRING.clone().chain([ZERO]).any(|i| {
                 chosen.x[i].abs() > 0.1 * chosen.covariance[i][i].sqrt() && chosen.set >> i & 1 == 1
             });
             let before = chosen.x;
-            self.residual = frame.residual(&chosen.x, chosen.set);
             self.spring.move_by(&before, self.deflection);
             if step + 1 < STEPS && far && !self.spring.is_settled() {
                 continue;
@@ -204,6 +199,21 @@ impl Blocks {
             (self.posterior, self.frame) = (Some(chosen), Some(frame));
             break;
         }
+    }
+
+    /// Standard deviation of the declared zero, rad.
+    pub(super) fn near(&self) -> f64 {
+        self.priors.deflection_offset * self.deflection + self.readings.resolution
+    }
+
+    /// What the chosen unknowns leave of the rows; its variance, (N·m)². `torque`: variance of the motor's.
+    fn leave(&mut self, frame: &Frame, chosen: &Posterior, total: &Gram, torque: f64) -> f64 {
+        self.residual = frame.residual(&chosen.x, chosen.set);
+        let own = total.quadratic(&self.residual) / total.rows;
+        self.own = own.sqrt().max(EXACT * total.rms(balance::TORQUE));
+        let usual = self.motor.fit_rms.map_or(0.0, |(_, torque)| torque); // little motion is no worse model
+        (self.fluctuation, self.unexplained) = (torque, self.own / torque.sqrt().max(usual));
+        own
     }
 
     /// The noise is what all unknowns together leave, the zero anywhere; it decides how many of them there are.

@@ -44,7 +44,7 @@ PROTECTIONS = [
         ("size of a carried joint file", "recording/mapping.py", "if len(carried) > MAX_BYTES:", "if False:", f"{LIMITS} -k huge_message"),
         ("size of a carried mapping", "recording/mapping.py", "    if len(data) > MAX_BYTES:", "    if False:", f"{LIMITS} -k huge_message"),
         ("number of records", "recording/mcapfile.py", "if messages.count > most:", "if False:", f"{LIMITS} -k 'without_end or so_many'"),
-        ("changes of mappings", "recording/canframes.py", "if self._listener.judged > self._most_judged:", "if False:", f"{LIMITS} -k changes_mappings"),
+        ("changes of mappings", "recording/canframes.py", "if self._judged > self._most_judged:", "if False:", f"{LIMITS} -k changes_mappings"),
         ("a state of another model", "recording/playback.py", "if own is None or (own.model(), own.estimator) != (joint.model(), joint.estimator):", "if False:", "tests/test_blackbox.py -k another_model"),
         ("size of a reload", "jointfile/apart.py", "if len(done.stdout) > _MAX_BYTES:", "if False:", "tests/test_jointfile.py -k another_process"),
         ("links in a black box's folder", "loop/finding.py", " | os.O_NOFOLLOW", "", "tests/test_blackbox.py -k others_put"),

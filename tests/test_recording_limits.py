@@ -21,6 +21,7 @@ from fuzzparsers import JOINT, RECORDINGS, TEXT, frames, held, read_every_way, w
 
 from drivelink._core import JsonNumbers, SyncNumbering
 from drivelink.canopen.eds import load_eds
+from drivelink.canopen.passivenode import PassiveNode
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import ZenohSection, load, parse
 from drivelink.recording import canframes, corrections, read
@@ -456,6 +457,18 @@ def test_a_megabyte_changes_mappings_less_often_than_it_has_frames(tmp_path):
     path = mcap_of(tmp_path / "r.mcap", [("can", k * 100_000, f.encode()) for k, f in enumerate(frames)])
     with one_line("changes of what its nodes send"):
         read(path, JOINT)
+
+
+def test_mappings_that_change_without_a_sync_end_at_the_limit_not_at_the_file_s_end(tmp_path, monkeypatch):
+    """A megabyte of BLF took 11 s: they were counted at each SYNC only."""
+    calls, made = [], PassiveNode.layout
+    monkeypatch.setattr(PassiveNode, "layout", lambda node: calls.append(1) or made(node))
+    toggled = [line for k in (0, 2) for line in (f"c 601#2F001A000{k}000000\n", "c 581#60001A0000000000\n")]
+    path = tmp_path / "r.log"
+    path.write_text("c 080#\n" * 8 + "".join(toggled) * 10_000)
+    with one_line("changes of what its nodes send"):
+        read(path, parse(TEXT + "[bus]\nconfigure = false\n"))
+    assert len(calls) < 10_000
 
 
 def _mapped(entries):

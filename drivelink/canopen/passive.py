@@ -6,7 +6,7 @@ This module cannot send. Only traffic and joint file are trusted, the traffic fi
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from drivelink.canopen.layout import BusLoad, NodeLayout, bus_load, roles_by_node
@@ -25,10 +25,17 @@ class PassiveConfigurator:
 
     Args:
         joints: joint files on this bus; the first one's bus section counts.
+        judging: is called before each layout that is made of what was heard.
     """
 
-    def __init__(self, joints: Sequence[JointFile], base_dirs: Sequence[Path] | None = None) -> None:
+    def __init__(
+        self,
+        joints: Sequence[JointFile],
+        base_dirs: Sequence[Path] | None = None,
+        judging: Callable[[], object] = lambda: None,
+    ) -> None:
         self.bus: BusSection = joints[0].bus
+        self._judging = judging
         self._nodes = {
             node: PassiveNode(role, self.bus) for node, role in roles_by_node(joints, base_dirs).items()
         }
@@ -36,7 +43,6 @@ class PassiveConfigurator:
         self.missing: dict[int, DriveError] = {}  # for the others, what is missing
         # of the nodes in `layouts`, those whose layout is not trusted now: reason and remedy
         self.doubts: dict[int, str] = {}
-        self.judged = 0  # layouts that were made of what was heard
         self.poll(0.0)
 
     @property
@@ -119,7 +125,7 @@ class PassiveConfigurator:
             if node.seen_changes == node.listener.changes:
                 continue
             node.seen_changes = node.listener.changes
-            self.judged += 1
+            self._judging()
             try:
                 layout, doubt = node.layout()
                 doubt = node.dispute() or doubt

@@ -40,6 +40,7 @@ class PassiveNode:
         self.role, self._bus = role, bus
         self._sheet = load_eds(role.eds, role.node_id) if role.eds is not None else None
         self._units = {address for vendor in VENDORS.values() for address in unit_objects(role, vendor)}
+        self._followed = self._units.union(_COMMUNICATION, _STORED)
         self.listener = SdoSniffer(self._interesting, bus.sdo_timeout_s)
         self.seen_changes = -1
         self.state = (-1, False)  # changes and `being_mapped` after its last frame
@@ -54,7 +55,7 @@ class PassiveNode:
     def _interesting(self, index: int, subindex: int) -> bool:
         if is_mapping((index, subindex)):
             return subindex <= _MOST_ENTRIES
-        return (index, subindex) in self._units | _COMMUNICATION or (index, subindex) in _STORED
+        return (index, subindex) in self._followed
 
     def restart(self) -> None:
         """Handle a boot-up: mapping and parameters are the node's defaults again."""

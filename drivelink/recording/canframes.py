@@ -91,7 +91,8 @@ class FrameLog:
         self._frames = frames()
         self._follow = joint.bus.sync == "follow"
         self._passive = not joint.bus.configure
-        self._listener = PassiveConfigurator([joint], [base_dir])
+        self._judged = 0  # changes of what its nodes send
+        self._listener = PassiveConfigurator([joint], [base_dir], self._count_mapping)
         self._head: list[LoggedFrame] = []  # after the configuration, read already
         syncs, heard, before = self._learn_configuration()
         declared = not self._listener.busy
@@ -99,7 +100,7 @@ class FrameLog:
         if before or not heard:
             known = recorded_layouts(path, joint.name, daemon=declared, begun=heard)
         if known:
-            self._listener = PassiveConfigurator([joint], [base_dir])
+            self._listener = PassiveConfigurator([joint], [base_dir], self._count_mapping)
             self._listener.adopt(known)  # the nodes were configured before the recording began
             self._head, self._frames = [], frames()
         self._check_complete()
@@ -124,7 +125,6 @@ class FrameLog:
             for cycle in assembly.cycles(frames, jump):
                 samples = samples or cycle.sample is not None
                 yield cycle
-            self._require_few_mappings()
         doubts = list(assembly.follower.doubts.values())
         if not samples:
             why = f": {doubts[0]}" if doubts else self._absent(heard)
@@ -132,8 +132,9 @@ class FrameLog:
         for doubt in doubts:
             _LOG.warning("%s: at its end, %s", self._path, doubt)
 
-    def _require_few_mappings(self) -> None:
-        if self._listener.judged > self._most_judged:
+    def _count_mapping(self) -> None:
+        self._judged += 1
+        if self._judged > self._most_judged:
             raise RecordingError(
                 f"{self._path}: expected at most {self._most_judged} changes of what its nodes send, got more"
             )
@@ -180,7 +181,6 @@ class FrameLog:
                 if not listener.feed(can_id, data, now_s):
                     continue
                 changed = listener.poll(now_s)
-                self._require_few_mappings()
                 if changed:
                     head.clear()
                     quiet, heard, before = 0, True, before or (not heard and bool(syncs))

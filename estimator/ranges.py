@@ -59,6 +59,11 @@ RANGES: dict[str, Range] = {  # the longest end that fits counts
     "read_back_s": Range(1e-3, 1e5, "s"),
     "_per_hour": Range(1e-9, 1e6, "1/h"),
     "_per_rev": Range(1e-6, 1e12, "per revolution"),
+    # of these four, what the bits of a float would say is out of range
+    "counts_per_rev": Range(1e-6, 2.0**29, "per revolution"),  # of the finest encoders
+    "rated_torque_nm": Range(1e-12, 1e5, "N·m"),
+    "rated_current_a": Range(1e-12, 1e5, "A"),
+    "torque_constant_nm_a": Range(1e-9, 500.0, "N·m/A"),
     "gear_ratio": Range(1e-6, 1e6, ""),
     "exponent": Range(1e-3, 1e3, ""),
     "power": Range(1e-3, 99.0, ""),

@@ -1,4 +1,5 @@
 import math
+import struct
 
 import pytest
 from canopenkit import joint_text
@@ -174,6 +175,27 @@ def test_a_unit_of_an_erased_memory_is_not_known(address, signal):
     assert [one for one in found if signal in one.missing] and not [
         one for one in found if signal in one.candidates
     ]
+
+
+@pytest.mark.parametrize(
+    ("address", "signal", "key"),
+    [
+        ((0x608F, 1), Signal.MOTOR_POSITION, "motor[1].drive: counts_per_rev"),
+        ((0x6091, 1), Signal.MOTOR_POSITION, "motor[1].drive: gear_ratio"),
+        ((0x6501, 0), Signal.LINK_POSITION, "link.encoder: counts_per_rev"),
+        ((0x6076, 0), Signal.MOTOR_TORQUE, "motor[1].drive: rated_torque_nm"),
+    ],
+)
+@pytest.mark.parametrize("value", [0.01, 1.0, 65536.0])
+def test_the_bits_of_a_float_are_no_unit(value, address, signal, key):
+    """A link encoder of 1.2e9 counts, the bits of 131072.0: the stiffness was 49 % off, valid."""
+    (bits,) = struct.unpack("<I", struct.pack("<f", value))
+    told = {**PLAIN, (0x6501, 0): 4096, address: bits}
+    link = '[link.encoder]\nsource = "cia406"\nnode_id = 9'
+    found = [offer(role, told, GENERIC) for role in roles(parse(joint_text(link=link)))]
+    (said,) = [one for result in found for one in result.notices if "it is not used" in one.text]
+    assert said.fix.startswith(f"{key} = …, or correct 0x{address[0]:04X}")
+    assert not [result for result in found if signal in result.candidates]
 
 
 @pytest.mark.parametrize(

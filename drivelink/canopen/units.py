@@ -15,6 +15,7 @@ from functools import partial
 from drivelink.canopen.layout import MappedObject, Offer, Role, Signal, object_address
 from drivelink.canopen.vendors import Vendor, angle_unit_rad, velocity_unit_rad_s
 from drivelink.jointfile import DriveSection, EncoderSection
+from estimator.ranges import range_of
 
 Address = tuple[int, int]
 
@@ -95,18 +96,7 @@ class _Drive:
     def _choose(
         self, what: str, key: str, stated: float | None, reported: float | None, source: str
     ) -> float | None:
-        """Return the declared value, else the reported one; a finding if they disagree."""
-        if stated is None or reported is None:
-            return reported if stated is None else stated
-        if not math.isclose(stated, reported, rel_tol=_SAME):
-            self._result.warn(
-                self._role.subject,
-                f"{what}: the drive says {reported:.6g} ({source}), the joint file {stated:.6g}; "
-                f"{stated:.6g} is used",
-                f"{self._role.key}: {key} = {reported:.6g}, or leave it out, "
-                f"or correct {source} in the drive",
-            )
-        return stated
+        return _chosen(self._role, self._result, what, f"{self._role.key}: {key}", stated, reported, source)
 
     def _ratio(self, numerator: Address, denominator: Address) -> float | None:
         above, below = self._reported.get(numerator, 0), self._reported.get(denominator, 1)
@@ -123,7 +113,11 @@ class _Drive:
         reported, source = self._drive_gear()
         stated = self._drive.gear_ratio
         if "gear_ratio" not in self._drive.model_fields_set:
-            return stated if reported is None else reported
+            chosen = self._choose("gear ratio", "gear_ratio", None, reported, source)
+            if chosen is None and reported is not None:
+                text = f"no possible gear ratio in {source}, set {self._role.key}: gear_ratio"
+                self._result.missing[Signal.MOTOR_POSITION] = text
+            return stated if chosen is None else chosen
         if reported == 1.0 and stated != 1.0:  # usual: the drive was never configured with its gear
             self._result.info(
                 self._role.subject,
@@ -158,9 +152,10 @@ class _Drive:
     def _position(self, counts: float | None, gear: float) -> None:
         if counts is None:
             self._result.missing[Signal.MOTOR_POSITION] = (
-                "counts per motor revolution are unknown: the drive does not report them (0x608F), "
+                "counts per motor revolution are unknown: the drive reports no possible number (0x608F), "
                 f"set {self._role.key}: counts_per_rev"
             )
+        if counts is None or Signal.MOTOR_POSITION in self._result.missing:
             return
         scale = self._drive.direction * math.tau / (counts * gear)
         feed = self._ratio((0x6092, 1), (0x6092, 2))
@@ -247,7 +242,7 @@ class _Drive:
             self._result.candidates[Signal.MOTOR_TORQUE] = chosen
         else:
             self._result.missing[Signal.MOTOR_TORQUE] = (
-                "the scale of its torque is unknown: the drive reports neither rated torque (0x6076) nor "
+                "the scale of its torque is unknown: the drive reports no possible rated torque (0x6076) or "
                 f"rated current (0x6075), set {self._role.key}: rated_torque_nm, or torque_constant_nm_a and "
                 "rated_current_a or current_object"
             )
@@ -331,6 +326,25 @@ class _Drive:
             )
 
 
+def _chosen(
+    role: Role, result: Offer, what: str, key: str, stated: float | None, reported: float | None, source: str
+) -> float | None:
+    """Return the declared value, else the reported one if it is in range; a finding if they disagree."""
+    allowed = range_of(key)
+    if reported is not None and not allowed.least <= reported <= allowed.most:
+        text = f"{what}: the node says {reported:.6g} ({source}), expected {allowed}; it is not used"
+        result.warn(role.subject, text, f"{key} = …, or correct {source} in the node")
+        return stated
+    if stated is not None and reported is not None and not math.isclose(stated, reported, rel_tol=_SAME):
+        result.warn(
+            role.subject,
+            f"{what}: the node says {reported:.6g} ({source}), the joint file {stated:.6g}; "
+            f"{stated:.6g} is used",
+            f"{key} = {reported:.6g}, or leave it out, or correct {source} in the node",
+        )
+    return reported if stated is None else stated
+
+
 def _object(
     signal: Signal, address: Address, bits: int, scale: float, *, wraps: bool = False
 ) -> MappedObject:
@@ -355,21 +369,14 @@ def _offer_link(role: Role, encoder: EncoderSection, reported: Mapping[Address, 
     else:
         above, below = reported.get((0x60E6, address[1]), 0), reported.get((0x60EB, address[1]), 1)
         counts, source = (above / below if above > 1 and below else None), "0x60E6"
-    stated = encoder.counts_per_rev
-    used = counts if stated is None else stated
+    what, key = "link encoder, counts per revolution", "link.encoder: counts_per_rev"
+    used = _chosen(role, result, what, key, encoder.counts_per_rev, counts, source)
     if used is None:
         result.missing[Signal.LINK_POSITION] = (
-            f"counts per joint revolution are unknown: the node does not report them ({source}), "
+            f"counts per joint revolution are unknown: the node reports no possible number ({source}), "
             "set link.encoder.counts_per_rev"
         )
         return
-    if stated is not None and counts is not None and not math.isclose(stated, counts, rel_tol=_SAME):
-        text = f"link encoder, counts per revolution: the node says {counts:.6g} ({source}), "
-        result.warn(
-            role.subject,
-            f"{text}the joint file {stated:.6g}; {stated:.6g} is used",
-            f"link.encoder: counts_per_rev = {counts:.6g}, or leave it out",
-        )
     result.candidates[Signal.LINK_POSITION] = (
         MappedObject(
             signal=Signal.LINK_POSITION,

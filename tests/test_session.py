@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 import zenohkit
-from daemonkit import served, vsa
+from daemonkit import served, vsa, vsa_text
 from zenohkit import LIMIT_S, joint_text, ready, script, until
 
 from drivelink.daemon.service import Daemon, ServedJoint
@@ -219,3 +219,19 @@ def test_connections_that_say_nothing_lock_no_subscriber_out(three):
             stack.enter_context(socket.create_connection((host, int(port))))
         with open_client(endpoint) as session:
             hear(session, {"a", "b", "c"})
+
+
+@pytest.mark.parametrize("command", [["run", "elbow.toml", "--interface", "socketcand"], ["monitor"]])
+def test_where_too_few_files_may_be_open_it_is_one_line_before_zenoh(command, tmp_path):
+    """Zenoh ended the process by a backtrace."""
+    (tmp_path / "elbow.toml").write_text(vsa_text())
+    ran = subprocess.run(
+        ["sh", "-c", 'ulimit -n 20; exec "$@"', "sh", sys.executable, "-m", "drivelink", *command],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+    assert (ran.returncode, ran.stderr.count("\n")) == (6, 1), ran.stderr
+    assert "open files: expected a limit of at least 64, got 20: ulimit -n 8192" in ran.stderr

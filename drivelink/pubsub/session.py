@@ -151,6 +151,7 @@ ENDPOINT = "tcp/127.0.0.1:7447"
 _LINKS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream", "serial", "vsock")
 _MOST_CONFIG_BYTES = 256 << 10
 FILES = 8192  # open files: more than the connections that may wait
+_LEAST_FILES = 64  # of which a daemon takes two dozen; a child process and subscribers need more
 
 _COMMON: dict[str, Any] = {
     "mode": "peer",
@@ -194,9 +195,11 @@ def open_session(section: ZenohSection, base_dir: Path) -> zenoh.Session:
         base_dir: base of a relative `config`: the joint file's directory.
 
     Raises:
-        ZenohError: the configuration file cannot be used, or the endpoint is taken by another program.
+        ZenohError: the configuration file cannot be used, the endpoint is taken by another program, or too
+            few files may be open.
     """
     _allow_files()
+    _require_files()
     if section.config is not None:
         return _open(_read(base_dir / section.config))
     endpoint = _require_endpoint(section.endpoint)
@@ -216,8 +219,9 @@ def open_client(endpoint: str, config: str | Path | None = None) -> zenoh.Sessio
         config: a zenoh configuration file (JSON5) instead of the endpoint.
 
     Raises:
-        ZenohError: the endpoint or the configuration file cannot be used.
+        ZenohError: the endpoint or the configuration file cannot be used, or too few files may be open.
     """
+    _require_files()
     if config is not None:
         return _open(_read(Path(config)))
     return _open(client_config(_require_endpoint(endpoint)))
@@ -229,6 +233,14 @@ def _allow_files() -> None:
     wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+def _require_files() -> None:
+    """Refuse a limit of open files at which zenoh would end the process, by a backtrace."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY and soft < _LEAST_FILES:
+        wanted = f"expected a limit of at least {_LEAST_FILES}"
+        raise ZenohError(f"open files: {wanted}, got {soft}: ulimit -n {FILES}")
 
 
 def _join(endpoint: str) -> zenoh.Session:

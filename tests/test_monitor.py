@@ -76,6 +76,14 @@ def test_the_view_fits_the_terminal(motors, truth):
         assert len(shown) <= height and all(len(line) <= width for line in shown)
 
 
+def test_a_narrow_view_ends_a_number_with_an_ellipsis_and_has_no_sparkline_of_one_sign():
+    for width, truth in ((80, True), (80, False), (60, True), (60, False), (50, False)):
+        for line in lines(filled(truth=truth), width)[1:4]:
+            text = line[2:-2].rstrip()
+            assert text.endswith("…") or len(text) < width - 4, line  # else the frame cuts it
+            assert width < 80 or "…" not in text
+
+
 def test_the_view_says_what_matters_at_80_by_24():
     text = "\n".join(lines(filled(truth=True)))
     for part in ("elbow", "running", "stiffness", "±", "N·m/rad", "truth", "rms error 0.20 %", "torque", "deflection",

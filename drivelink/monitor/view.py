@@ -204,10 +204,6 @@ class JointView:
 
     def _numbers(self, width: int) -> Table:
         """Stiffness, torque, deflection: value, band, truth, sparkline."""
-        table = Table.grid(padding=(0, 2, 0, 0))
-        for least in (10, 25, 26):
-            table.add_column(no_wrap=True, min_width=least)
-        table.add_column(no_wrap=True, ratio=1)
         estimate, window = self.history.latest, self.history.window()
         if estimate is None:
             waiting = Table.grid()
@@ -215,50 +211,56 @@ class JointView:
             return waiting
         last = window[-1]
         known = math.isfinite(last.true_stiffness_nm_rad)
-        spark = max(4, width - (74 if known else 69))
+        spark = width - (78 if known else 69)
+        table = Table.grid(padding=(0, 2, 0, 0))
+        for least in (
+            10,
+            25,
+            26,
+        ):  # where it is narrower, an ellipsis ends a number: half of one is another one
+            table.add_column(no_wrap=True, min_width=least if width >= 70 else None)
+        if spark >= 4:
+            table.add_column(no_wrap=True, ratio=1)
         ink = ESTIMATE if self.live and last.valid else "dim"
         stiffness, half = value_and_interval(last.stiffness_nm_rad, half_interval(estimate))
         band = f" ± {half}" if half else ""
+        rows: list[tuple[RenderableType, ...]] = []
         for label, value, extra, unit, true, error, series in (
             ("stiffness", stiffness, band, "N·m/rad", last.true_stiffness_nm_rad, self.errors[0],
              [m.stiffness_nm_rad if m.valid else math.nan for m in window]),
             ("torque", self._torque(last.torque_nm), "", "N·m", last.true_torque_nm, self.errors[1],
              [m.torque_nm if m.valid else math.nan for m in window]),
         ):  # fmt: skip
-            table.add_row(
-                label,
-                Text.assemble((value, f"bold {ink}"), extra, f" {unit}"),
-                Text.assemble(
-                    "truth ",
-                    (number(true) if label == "stiffness" else self._torque(true), TRUTH),
-                    f"  rms error {100 * error:.2f} %" if last.valid and math.isfinite(error) else "",
-                )
-                if known
-                else "",
-                Text(sparkline(series, spark), style=ink),
+            truth = Text.assemble(
+                "truth ",
+                (number(true) if label == "stiffness" else self._torque(true), TRUTH),
+                f"  rms error {100 * error:.2f} %" if last.valid and math.isfinite(error) else "",
             )
-        self._add_external(table, spark, ink)
-        table.add_row(
-            "deflection", f"{self.deflections('   ')} rad", self._each(estimate) if not known else "", ""
+            shown = Text.assemble((value, f"bold {ink}"), extra, f" {unit}")
+            rows.append((label, shown, truth if known else "", Text(sparkline(series, spark), style=ink)))
+        rows += self._external(spark, ink)
+        rows.append(
+            ("deflection", f"{self.deflections('   ')} rad", "" if known else self._each(estimate), "")
         )
+        for row in rows:
+            table.add_row(*row[: len(table.columns)])
         return table
 
-    def _add_external(self, table: Table, spark: int, ink: str) -> None:
-        """The row of the external torque, with link dynamics."""
+    def _external(self, spark: int, ink: str) -> list[tuple[RenderableType, ...]]:
+        """The row of the external torque; none without link dynamics."""
         touch = self.history.touch
         if touch is None:
-            return
+            return []
         series = [t.torque_nm if t.valid else math.nan for t in self.history.touches]
         value, half = value_and_interval(touch.torque_nm, SIGMA_95 * touch.std_nm)
-        band = f" ± {half} N·m" if touch.valid else ""
-        value = value if touch.valid else "not valid"
-        contact = Text("contact", style="bold yellow") if touch.contact and self.live else Text("")
-        table.add_row(
-            "external",
-            Text.assemble((value, f"bold {ink}"), band),
-            contact if touch.valid else Text(self.external_doubt(True), style="dim"),
-            Text(sparkline(series, spark), style=ink),
+        shown = Text.assemble(
+            (value if touch.valid else "not valid", f"bold {ink}"), f" ± {half} N·m" if touch.valid else ""
         )
+        contact = Text("contact", style="bold yellow") if touch.contact and self.live else Text("")
+        doubt = Text(self.external_doubt(True), style="dim")
+        return [
+            ("external", shown, contact if touch.valid else doubt, Text(sparkline(series, spark), style=ink))
+        ]
 
     @staticmethod
     def _each(estimate: EstimateMessage) -> str:

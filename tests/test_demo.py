@@ -19,7 +19,7 @@ from rich.console import Console
 from zenohkit import LIMIT_S, until
 
 from drivelink import cli, jointfile
-from drivelink.demo.closedloop import STEPS
+from drivelink.demo.closedloop import CASES, STEPS, ClosedLoop
 from drivelink.demo.closing import Comparison, as_json
 from drivelink.demo.closing import closing as closing_section
 from drivelink.demo.rig import RunSummary
@@ -88,6 +88,29 @@ def test_a_live_view_is_drawn_by_the_thread_that_feeds_it(monkeypatch):
     subscription = SimpleNamespace(cycles=lambda _: [message(1, 2.0, 100.0), None], status=None)
     run.follow(RigProcess(SimpleNamespace(poll=poll), lambda: None), subscription)
     assert len(drawn) > 2 and set(drawn) == {threading.current_thread()}
+
+
+@pytest.mark.parametrize(
+    ("pressed", "why"), [(["n"], "not accepted"), ([], "the time is over (--seconds): nobody accepted")]
+)
+def test_a_loop_that_stays_open_says_why(pressed, why, monkeypatch):
+    console = Console(width=100, record=True, file=io.StringIO())
+    offer = SimpleNamespace(lines=lambda: ["friction"])
+    monkeypatch.setattr("drivelink.demo.closedloop.proposal", lambda _: offer)
+    run = ClosedLoop(
+        jointfile.load(ELBOW), ELBOW, CASES["friction"], console, live=False, yes=False, limit_s=0.3
+    )
+    run._keys = SimpleNamespace(there=True, pressed=lambda: pressed)
+    run.times = dict.fromkeys(("changed", "alarm"), time.time())
+    ended = []
+    run._stop = lambda: ended.append(True)
+    subscription = SimpleNamespace(
+        cycles=lambda _: [], status=None, finding={"state": "proposed"}, model=None, latest=lambda: None
+    )
+    while not ended:
+        run._take(subscription)
+        time.sleep(0.05)
+    assert console.export_text().splitlines()[-1] == why
 
 
 def closing(comparison: Comparison) -> str:

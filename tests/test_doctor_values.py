@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 from canopenkit import Slave, Wire, drive_objects, joint_text
@@ -114,6 +115,22 @@ def test_where_the_nodes_stall_there_is_a_gap_and_after_long_the_recording_ends(
     assert record.motor_position_rad[0, 0] == pytest.approx(math.sin(2.0 * 2.5), abs=1e-3)
     steps = [after - before for before, after in itertools.pairwise(record.sequence)]
     assert max(steps) in (11, 12) and steps.count(1) == len(steps) - 1  # 0.11 s, by where the grid lies
+
+
+def test_a_timer_that_was_late_by_a_period_once_is_why_cycles_are_left_out(monkeypatch):
+    """The daemon says of such a machine that the doctor says why."""
+    now_ns, sleeps = [0], iter([0.0] * 50 + [0.002] + [0.0] * 1000)
+
+    def sleep(seconds):
+        now_ns[0] += int((seconds + next(sleeps)) * 1e9)
+
+    monkeypatch.setattr(
+        "drivelink.doctor.machine.time", SimpleNamespace(monotonic_ns=lambda: now_ns[0], sleep=sleep)
+    )
+    section = Section("Machine")
+    examine_machine(section, 0.001, 0.5)
+    (timer,) = (finding for finding in section.notices if finding.subject == "timer")
+    assert timer.severity is Severity.WARNING and "leaves a cycle out" in timer.text and timer.fix
 
 
 @pytest.mark.parametrize(("limit", "severity"), [(1024, Severity.WARNING), (8192, Severity.OK)])

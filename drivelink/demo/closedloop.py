@@ -28,7 +28,14 @@ from estimator.reasons import percent
 from estimator.sample import SIGMA_95, Status
 
 AFTER_S = 10.0
-STEPS = ("alarm", "recorded", "found", "accepted", "fallen")
+_MISSING = {  # of each step, where the time is over before it
+    "alarm": "there was no model alarm",
+    "recorded": "nothing was kept",
+    "found": "the diagnosis has not ended",
+    "accepted": "nobody accepted",
+    "fallen": "the residual has not fallen",
+}
+STEPS = tuple(_MISSING)
 _LINES = 13  # of the live view, below what is said
 _AFTERGLOW_S = 3.0  # of the healthy view at the end
 
@@ -89,7 +96,7 @@ class ClosedLoop(DemoRun):
         self.trial: Trial | None = None  # the residual after it, or None
         self._path, self._case, self._yes = path, case, yes
         self._keys = Keys()
-        self._end_s = time.monotonic() + limit_s
+        self._limit_s = self._end_s = time.monotonic() + limit_s
         self._asking = False
 
     def follow(self, rig: Any, subscription: Subscription) -> bool:
@@ -118,6 +125,9 @@ class ClosedLoop(DemoRun):
                 self._note("fallen" if fallen else "not fallen", self.trial.sentence())
                 self._end_s = min(self._end_s, time.monotonic() + _AFTERGLOW_S)
         if time.monotonic() >= self._end_s:
+            missing = next((text for step, text in _MISSING.items() if step not in self.times), "")
+            if missing and self._end_s == self._limit_s:
+                self._say(f"the time is over (--seconds): {missing}")
             self._end_s = math.inf
             self._stop()
 
@@ -151,6 +161,7 @@ class ClosedLoop(DemoRun):
                 self._asking = False
                 self._accept()
             elif key in "nN" and self._asking:
+                self._say("not accepted")
                 self._asking, self._end_s = False, time.monotonic()
 
     def _accept(self) -> None:

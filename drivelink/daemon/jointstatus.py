@@ -75,6 +75,7 @@ class JointStatus:
             state: "starting" or "stopped"; default: determined from the loop.
         """
         loop, loop_joint, events = self._loop, self._loop_joint, self._events
+        others = self._supervisor.others(loop_joint)
         now = time.monotonic()
         before_s, before_estimates, before_cpu_s = self._before
         cpu_s, elapsed_s = time.process_time(), max(now - before_s, 1e-9)
@@ -109,8 +110,8 @@ class JointStatus:
             "external": self._external(),
             "suspected": self._supervisor.contradiction(loop_joint) or self._suspicion(),
             "cross_checks": cross_checks(loop_joint.pipeline.assembler),
-            "conditions": sorted(events.active.values()),
-            "events": events.recent(),
+            "conditions": sorted(text for text in events.active.values() if not text.startswith(others)),
+            "events": [event for event in events.recent() if not event["text"].startswith(others)],
         }
 
     def _state(self) -> str:

@@ -104,6 +104,12 @@ class Supervisor:
         now, nodes = self._loop.clock(), self._nodes.items()
         return {str(node): one.status(now) for node, one in nodes if one.loop_joint is loop_joint}
 
+    def others(self, loop_joint: LoopJoint) -> tuple[str, ...]:
+        """Return how events begin that are of other joints of the bus alone."""
+        names = [f"{one.name}:" for one in self._loop.loop_joints if one is not loop_joint]
+        nodes = [node for node, one in self._nodes.items() if one.loop_joint is not loop_joint]
+        return (*names, *(f"node {node}{sign}" for node in nodes for sign in ": "))
+
     def step(self, now_ns: int) -> None:
         """Advance running configurations."""
         if self._configurator.busy:

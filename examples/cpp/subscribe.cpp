@@ -1,4 +1,4 @@
-// Print a joint's estimates, gaps counted, with zenoh-pico: subscribe [JOINT [ENDPOINT [COUNT]]]
+// Print a joint's estimates, those missing counted, with zenoh-pico: subscribe [JOINT [ENDPOINT [COUNT]]]
 
 #include <zenoh-pico.h>
 
@@ -13,22 +13,22 @@
 namespace {
 
 // Print one message of the key; false if it is no estimate.
-bool show(const z_loaned_sample_t *sample, uint64_t *last, uint64_t *gaps) {
+bool show(const z_loaned_sample_t *sample, uint64_t *last, uint64_t *missing) {
     uint8_t payload[512];
     z_bytes_reader_t reader = z_bytes_get_reader(z_sample_payload(sample));
     const size_t length = z_bytes_reader_read(&reader, payload, sizeof payload);
     drivelink_estimate estimate;
     if (!drivelink_decode_estimate(payload, length, &estimate)) return false;
-    if (*last != 0 && estimate.sequence > *last) *gaps += estimate.sequence - *last - 1;
+    if (*last != 0 && estimate.sequence > *last) *missing += estimate.sequence - *last - 1;
     *last = estimate.sequence;
     const auto now = std::chrono::system_clock::now().time_since_epoch();
     const int64_t now_ns = std::chrono::duration_cast<std::chrono::nanoseconds>(now).count();
     std::printf("%" PRIu64 " %.3f N·m, %.5g ± %.2g N·m/rad, valid %d, observable %d, usable %d, %" PRId64
-                " µs after its SYNC, %" PRIu64 " gaps\n",
+                " µs after its SYNC, %" PRIu64 " missing\n",
                 estimate.sequence, estimate.flexibility_torque_nm, estimate.stiffness_nm_rad,
                 estimate.stiffness_std_nm_rad, drivelink_valid(&estimate),
                 (estimate.status & DRIVELINK_OBSERVABLE) != 0, drivelink_usable(&estimate),
-                (now_ns - static_cast<int64_t>(estimate.stamp_ns)) / 1000, *gaps);
+                (now_ns - static_cast<int64_t>(estimate.stamp_ns)) / 1000, *missing);
     return true;
 }
 
@@ -46,10 +46,10 @@ int run(const z_loaned_session_t *session, const std::string &key, long count) {
         std::fprintf(stderr, "%s: cannot be subscribed to\n", key.c_str());
         return 1;
     }
-    uint64_t last = 0, gaps = 0;
+    uint64_t last = 0, missing = 0;
     z_owned_sample_t sample;
     while (count > 0 && z_recv(z_loan(handler), &sample) == Z_OK) {
-        if (show(z_loan(sample), &last, &gaps)) count--;
+        if (show(z_loan(sample), &last, &missing)) count--;
         std::fflush(stdout);
         z_drop(z_move(sample));
     }

@@ -1,4 +1,4 @@
-//! Print a joint's estimates, gaps counted: `cargo run -- elbow [tcp/127.0.0.1:7447 [COUNT]]`.
+//! Print a joint's estimates, those missing counted: `cargo run -- elbow [tcp/127.0.0.1:7447 [COUNT]]`.
 
 use std::io::{self, Write};
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -24,7 +24,7 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         .wait()?;
 
     let mut last: Option<u64> = None;
-    let mut gaps = 0;
+    let mut missing = 0;
     for _ in 0..count {
         let sample = subscriber.recv()?;
         let estimate = match Estimate::decode(sample.payload()) {
@@ -34,14 +34,14 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
                 continue;
             }
         };
-        gaps += last.map_or(0, |last| estimate.sequence.saturating_sub(last + 1));
+        missing += last.map_or(0, |last| estimate.sequence.saturating_sub(last + 1));
         last = Some(estimate.sequence);
         let now_ns = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as i128;
         // Two digits of the uncertainty, and the value as far.
         let places = (1.0 - estimate.stiffness_std_nm_rad.log10().floor()).clamp(0.0, 9.0) as usize;
         let written = writeln!(
             io::stdout(),
-            "{} {:.3} N·m, {:.places$} ± {:.places$} N·m/rad, valid {}, observable {}, usable {}, {} µs after its SYNC, {} gaps",
+            "{} {:.3} N·m, {:.places$} ± {:.places$} N·m/rad, valid {}, observable {}, usable {}, {} µs after its SYNC, {} missing",
             estimate.sequence,
             estimate.flexibility_torque_nm,
             estimate.stiffness_nm_rad,
@@ -50,7 +50,7 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
             estimate.observable(),
             estimate.usable(),
             (now_ns - i128::from(estimate.stamp_ns)) / 1000,
-            gaps
+            missing
         );
         match written {
             Err(error) if error.kind() == io::ErrorKind::BrokenPipe => break, // `| head`

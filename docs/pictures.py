@@ -66,8 +66,12 @@ def terminal(
     shows: str,
     columns: int = COLUMNS,
     lines: int = LINES,
-) -> None:
-    """Run a command in a terminal, and draw what it shows so many seconds after it shows a word."""
+    interrupt: bool = True,
+) -> str:
+    """Run a command in a terminal, and draw what it shows so many seconds after it shows a word.
+
+    Return what it leaves there, at its own end or after Ctrl-C.
+    """
     screen = pyte.Screen(columns, lines)
     stream = pyte.ByteStream(screen)
     master, slave = pty.openpty()
@@ -88,11 +92,12 @@ def terminal(
         if not begun and any(shows in row for row in screen.display):
             begun, end = True, time.monotonic() + seconds
     text = picture(screen)
-    process.send_signal(signal.SIGINT)
-    while process.poll() is None:
+    if interrupt or not begun:
+        process.send_signal(signal.SIGINT)
+    while process.poll() is None or select.select([master], [], [], 0.0)[0]:
         if select.select([master], [], [], 0.2)[0]:
             try:
-                os.read(master, 65536)
+                stream.feed(os.read(master, 65536))
             except OSError:  # the other end is closed
                 break
     process.wait(timeout=30)
@@ -102,6 +107,7 @@ def terminal(
     console = Console(record=True, width=columns, file=io.StringIO(), force_terminal=True)
     console.print(text, end="")
     path.write_text(console.export_svg(title=title, code_format=SVG, unique_id=path.stem), encoding="utf-8")
+    return "\n".join(row.rstrip() for row in screen.display).strip("\n")
 
 
 def picture(screen: pyte.Screen) -> Text:
@@ -153,9 +159,12 @@ def pages(url: str, name: str, below: str, wait_s: float = 1.0) -> None:
 
 
 def demo(_: Path) -> None:
-    """`drivelink demo` in a terminal."""
-    command = (*DRIVELINK, "demo", "--seconds", "30")
-    terminal(command, 15.0, "drivelink demo", PICTURES / "demo.svg", shows="observable")
+    """`drivelink demo` in a terminal, and in README how the same run ends."""
+    path, title = PICTURES / "demo.svg", "drivelink demo"
+    said = terminal((*DRIVELINK, "demo"), 7.0, title, path, shows="observable", interrupt=False)
+    readme = ROOT / "README.md"
+    begin, _, rest = readme.read_text(encoding="utf-8").partition("```text\n")
+    readme.write_text(f"{begin}```text\n{said}\n```{rest.partition('```')[2]}", encoding="utf-8")
 
 
 def closed(_: Path) -> None:

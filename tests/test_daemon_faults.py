@@ -57,7 +57,7 @@ def test_cycles_lost_by_a_slow_machine_are_said_in_words_once():
         made.run(50)
         made.daemon.loop.overruns += 3  # as the pacing counts them
         made.run(100)
-        slow = "this machine is too slow for the cycle of 1 ms (drivelink doctor says why): cycles left out so far: 3"
+        slow = "this machine does not keep up with the cycle of 1 ms (drivelink doctor says why): cycles left out so far: 3"
         assert slow in made.events
         made.run(2000)
         assert "this machine keeps up with the cycle again; cycles left out: 3" in made.events

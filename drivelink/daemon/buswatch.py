@@ -137,7 +137,7 @@ class BusWatch:
             ]
             self._events.begin(
                 "too slow",
-                f"this machine is too slow for the cycle of {loop.period_ns / 1e6:g} ms "
+                f"this machine does not keep up with the cycle of {loop.period_ns / 1e6:g} ms "
                 f"(drivelink doctor says why): {', '.join(filter(None, counted))}",
             )
         elif now - self._slow_ns > _NS:

@@ -4,9 +4,11 @@ import os
 import pty
 import socket
 import threading
+import time
 import tty
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import pytest
@@ -15,7 +17,7 @@ from zenohkit import free_port, until
 
 from drivelink._core import JointPipeline
 from drivelink.canopen.bus import open_bus
-from drivelink.cycle.sources import BusLostError, open_source
+from drivelink.cycle.sources import BusLostError, BusSource, open_source
 from drivelink.daemon.service import Daemon
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
@@ -167,6 +169,16 @@ def test_a_socketcand_server_that_goes_and_comes_back_and_a_second_daemon_that_i
             assert not lost(daemon)
             until(recorded)
     sink.abandon()
+
+
+@pytest.mark.parametrize("stamp_s", [float("nan"), float("inf"), 1e300, 9.3e9, 0.0, -1.0])
+def test_a_time_that_no_interface_can_mean_is_that_of_the_reading(stamp_s):
+    """A frame that a socketcand server stamped "nan" ended the daemon and its black box."""
+    waiting = [can.Message(timestamp=stamp_s, arbitration_id=0x181, is_extended_id=False)]
+    bus = SimpleNamespace(recv=lambda _timeout: waiting.pop() if waiting else None)
+    before_ns = time.time_ns()
+    ((_, _, stamp_ns),) = BusSource(bus).receive()
+    assert before_ns <= stamp_ns <= time.time_ns()
 
 
 def test_error_frames_of_any_interface_are_counted_by_kind():

@@ -22,6 +22,8 @@ from fuzzparsers import JOINT, RECORDINGS, TEXT, frames, held, read_every_way, w
 from drivelink._core import JsonNumbers, SyncNumbering
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.passivenode import PassiveNode
+from drivelink.cli import require_distinct
+from drivelink.demo.simulate import world_from_joint
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import ZenohSection, load, parse
 from drivelink.recording import canframes, corrections, read
@@ -286,7 +288,7 @@ def test_the_joint_file_in_a_recording_opens_nothing(name, tmp_path):
     assert fleet.carried_joint(path).file == carried.joint
 
 
-@pytest.mark.parametrize("suffix", [*FORMATS, ".toml", ".eds", "the mapping"])
+@pytest.mark.parametrize("suffix", [*FORMATS, ".toml", ".eds", "the mapping", "the motion"])
 def test_only_regular_files_are_opened(suffix, tmp_path):
     path = tmp_path / f"r{suffix}"
     work = {".toml": lambda: load(path), ".eds": lambda: load_eds(path)}.get(
@@ -297,12 +299,20 @@ def test_only_regular_files_are_opened(suffix, tmp_path):
         path = side_file(tmp_path / "r.log")
         path.unlink(missing_ok=True)
         work = lambda: joint_of(tmp_path / "r.log", None)  # noqa: E731
+    if suffix == "the motion":
+        played = parse(f'{TEXT}[sim]\nexcitation = {{ kind = "motion", file = "{path}" }}\n')
+        work = lambda: world_from_joint(played)  # noqa: E731
     os.mkfifo(path)  # opening it would wait for a writer for ever
     with one_line("expected a regular file", DrivelinkError):
         work()
     path.unlink()
     path.symlink_to("/dev/zero")
     with one_line("expected a regular file", DrivelinkError):
+        work()
+    path.unlink()
+    path.symlink_to(path)  # to itself
+    with one_line("no such file|cannot be read.*levels of symbolic links", DrivelinkError):
+        require_distinct([path])
         work()
 
 

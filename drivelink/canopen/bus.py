@@ -36,6 +36,7 @@ _DELIVERY_S = {"virtual": 0.05, "socketcan": 0.05}  # a frame is there as soon a
 _SLOWEST_DELIVERY_S = 0.5  # servers and adapters delay frames after they are opened
 _SYS_NET = Path("/sys/class/net")
 _IFF_UP = 1
+_LAST_S = 9e9  # the last time that 64 bits of ns hold
 _WITHOUT_BITRATE = frozenset({"virtual", "socketcan", "socketcand", "udp_multicast"})
 
 _REASONS = {
@@ -322,6 +323,12 @@ def frames(bus: FrameBus, seconds: float, idle: Idle | None = None) -> Iterator[
 def is_canopen(message: can.Message) -> bool:
     """Return whether it is a data frame with an 11-bit identifier."""
     return not (message.is_extended_id or message.is_error_frame or message.is_remote_frame)
+
+
+def received_ns(message: can.Message) -> int:
+    """Return the UNIX time of a frame in ns: the interface's, or now where it gives none that is possible."""
+    seconds = message.timestamp
+    return int(seconds * 1e9) if 0.0 < seconds < _LAST_S else time.time_ns()
 
 
 def receive(bus: FrameBus, timeout_s: float) -> can.Message | None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import can
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.bus import FrameBus, frames, run_program, sender
+from drivelink.canopen.bus import FrameBus, frames, received_ns, run_program, sender
 from drivelink.canopen.emcy import nmt_state
 from drivelink.canopen.guard import check_frame
 from drivelink.canopen.pdo import read_identity, read_optional
@@ -71,7 +71,7 @@ class Traffic:
         self.counts[cob_id] = self.counts.get(cob_id, 0) + 1
         self.last[cob_id] = data
         if cob_id == SYNC_COB_ID and len(self.sync_s) < _MOST_STAMPS:
-            self.sync_s.append(message.timestamp)
+            self.sync_s.append(received_ns(message) * 1e-9)
         elif 0x701 <= cob_id <= 0x77F and len(data) == 1:
             self.heartbeats[cob_id - 0x700] = nmt_state(data[0] & 0x7F)
 

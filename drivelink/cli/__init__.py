@@ -240,13 +240,13 @@ def require_distinct(paths: Sequence[Path]) -> None:
     Raises:
         UsageError: one is given twice.
     """
-    seen: set[Path] = set()
+    seen: set[str] = set()
     for path in paths:
-        if path.resolve() in seen:
+        if (place := os.path.realpath(path)) in seen:
             raise UsageError(
                 f"{path}: given twice: expected another recording, which takes no part in the fit"
             )
-        seen.add(path.resolve())
+        seen.add(place)
 
 
 def warn(path: Path, lines: Sequence[str]) -> None:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import can
 
-from drivelink.canopen.bus import server_has_gone
+from drivelink.canopen.bus import received_ns, server_has_gone
 
 OVERFLOW = "receive overflow"  # key of `FrameSource.errors`: frames lost because they were not read in time
 MOST_FRAMES = 256  # limit per call, so that a babbling node cannot block the loop
@@ -148,8 +148,7 @@ class BusSource(FrameSource):
             if message.is_error_frame:
                 note_error(self.errors, message.arbitration_id, bytes(message.data))
             elif not (message.is_extended_id or message.is_remote_frame):
-                stamp_ns = int(message.timestamp * 1e9) or time.time_ns()
-                frames.append(CanFrame(message.arbitration_id, bytes(message.data), stamp_ns))
+                frames.append(CanFrame(message.arbitration_id, bytes(message.data), received_ns(message)))
         return frames
 
     def _receive(self, timeout_s: float) -> can.Message | None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import can
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.bus import Idle, frames, is_canopen
+from drivelink.canopen.bus import Idle, frames, is_canopen, received_ns
 from drivelink.canopen.configure import Configurator, configure_joints, refuse_foreign_sync
 from drivelink.canopen.emcy import nmt_state
 from drivelink.canopen.layout import NodeLayout, roles
@@ -113,7 +113,7 @@ def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[
         if message is None:
             yield -1, b"", 0
         elif is_canopen(message):
-            yield message.arbitration_id, bytes(message.data), int(message.timestamp * 1e9)
+            yield message.arbitration_id, bytes(message.data), received_ns(message)
 
 
 def _patiently(

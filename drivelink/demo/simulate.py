@@ -17,6 +17,7 @@ from typing import Any
 import can
 
 from drivelink.errors import JointFileError, UsageError
+from drivelink.files import open_regular
 from drivelink.jointfile import JointFile, MotorSection, SimSection
 from estimator.model import LinkDynamics
 from sim.canopen.drive import Cia402Drive
@@ -179,8 +180,12 @@ def _excitation(
     """Return the file's table, completed for the case or plant; a motion's file is beside the joint file."""
     table = section.excitation
     if table.get("kind") == "motion":
-        folder = Path() if file is None else file.parent
-        return {**following(plant), **table, "file": str(folder / str(table.get("file", "")))}
+        path = (Path() if file is None else file.parent) / str(table.get("file", ""))
+        try:
+            open_regular(path).close()
+        except OSError as error:
+            raise SimError(f"sim.excitation.file: {path}: cannot be read: {error.strerror}") from error
+        return {**following(plant), **table, "file": str(path)}
     if given is not None and table.get("kind") in (None, given.excitation["kind"]):
         return {**given.excitation, **table}
     suited = given.rich if given is not None else suitable(plant)

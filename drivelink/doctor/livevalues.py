@@ -14,7 +14,7 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from drivelink.canopen.bus import open_bus, run_program
+from drivelink.canopen.bus import open_bus, received_ns, run_program
 from drivelink.canopen.guard import SilentBus
 from drivelink.canopen.layout import MappedObject, Signal, roles
 from drivelink.canopen.node import NodeSurvey, survey_node
@@ -140,8 +140,7 @@ class Heard:
     def feed(self, message: can.Message) -> None:
         """Process a frame, in bus order."""
         if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
-            stamp_ns = round((message.timestamp or time.time()) * 1e9)
-            frame = LoggedFrame(stamp_ns, message.arbitration_id, bytes(message.data), "")
+            frame = LoggedFrame(received_ns(message), message.arbitration_id, bytes(message.data), "")
             self._keep(self._frames.feed(frame))
 
     def _keep(self, made: list[tuple[Sample, int]]) -> None:

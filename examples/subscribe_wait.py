@@ -17,9 +17,11 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
     with drivelink.subscribe(joint, endpoint=endpoint) as elbow:
         while time.monotonic() < end:
             estimate = elbow.wait(TIMEOUT_S)
-            if estimate is None or not estimate.usable or elbow.stale:
+            late = estimate is None or elbow.stale
+            if late or not estimate.usable:
                 if not safe:
-                    print(f"safe state: the daemon is {elbow.state}")
+                    why = f"no estimate in time, the daemon is {elbow.state}" if late else "it is not usable"
+                    print(f"safe state: {why}")
                 safe = True
                 continue
             if safe:

@@ -1,10 +1,14 @@
 """The examples run against a daemon in another process, in every language whose tools are here."""
 
+import itertools
 import os
 import re
+import runpy
 import shutil
 import subprocess
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from zenohkit import make_estimate, make_external, python
@@ -40,6 +44,20 @@ def run(*command, **options):
 def test_the_python_examples_run(daemon, name, expected, more):
     with python(EXAMPLES / name, "elbow", daemon, more) as process:
         assert any(re.search(expected, line) for line in process.stdout)
+
+
+def test_a_controller_in_its_safe_state_says_why(monkeypatch, capsys):
+    usable = SimpleNamespace(
+        usable=True, sequence=1, flexibility_torque_nm=0.0, stiffness_nm_rad=1.0, stiffness_std_nm_rad=0.1
+    )
+    for worse, why in ((None, "no estimate in time"), (SimpleNamespace(usable=False), "it is not usable")):
+        coming = itertools.chain([usable, worse], itertools.repeat(None))
+        elbow = SimpleNamespace(
+            wait=lambda _, c=coming: next(c), state="live", stale=False, gaps=0, foreign=0
+        )
+        monkeypatch.setattr("drivelink.subscribe", lambda *_, e=elbow, **__: nullcontext(e))
+        runpy.run_path(str(EXAMPLES / "subscribe_wait.py"))["main"](seconds="0.05")
+        assert why in capsys.readouterr().out
 
 
 @pytest.mark.rust

@@ -19,6 +19,7 @@ import chromium
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from drivelink.cli import main
 from drivelink.fleet import table
 from drivelink.fleet.page import page
 from drivelink.fleet.storage import FleetError, Source, Store
@@ -215,6 +216,24 @@ def test_damping_zero_and_parameters_of_sure_effects_are_tested_for_changes_and_
 def test_no_joint_is_called_steady_by_fewer_recordings_than_show_a_change(nights, said, rigid):
     rows = [night("elbow", k, 150.0 + 0.1 * (k % 2), []) | rigid for k in range(nights)]
     assert sentence(*rows).startswith(said) and page(summarise(rows, 0.05))
+
+
+def test_a_joint_that_lacked_an_effect_in_some_nights_is_not_merely_steady():
+    lacking = ["coulomb_friction@motor1"]
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 2), lacking if 3 <= k < 7 else []) for k in range(8)]
+    said = "Steady in the last recording; before it Coulomb friction (motor 1) was missing in 4 of 8."
+    assert sentence(*rows) == said and said in page(summarise(rows, 0.05))
+
+
+def test_on_a_terminal_the_sentence_of_a_joint_breaks_between_words(tmp_path, monkeypatch, capsys):
+    nights = [night("elbow", k, 150.0, ["coulomb_friction@motor"]) for k in range(2)]
+    append(tmp_path, *({**row(str(k)), **one, "id": str(k)} for k, one in enumerate(nights)))
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    assert main(["fleet", "report", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    words = " ".join(printed.split())
+    assert max(map(len, printed.split("wrote")[0].splitlines())) <= 40 and "elbow: The last 2 of 2" in words
 
 
 def test_an_unusable_stiffness_is_no_point_of_the_trend_but_a_cross_on_the_chart():

@@ -173,8 +173,11 @@ def _summary(counts: Counts) -> str:
 
 
 def _report(folder: str, *, as_json: bool) -> None:
+    from rich.console import Console
+
     from drivelink.fleet import page, summary, table
     from drivelink.fleet.storage import Store
+    from drivelink.output.document import Lines, Section, show
 
     store = Store(folder)
     document = summary.summarise(table.read_rows(store, summary.COLUMNS), _FALSE_SHARE)
@@ -183,9 +186,8 @@ def _report(folder: str, *, as_json: bool) -> None:
     if as_json:
         print(json.dumps(document))
         return
-    for joint in document["joints"]:
-        if joint["state"] in summary.LOOK:
-            print(clean_text(f"  {joint['joint']}: {joint['sentence']}"))
+    looks = [one for one in document["joints"] if one["state"] in summary.LOOK]
+    show([Section("", [Lines(tuple(f"{one['joint']}: {one['sentence']}" for one in looks))])], Console())
     for name in ("fleet.json", "fleet.html"):
         print(f"wrote {folder.rstrip('/')}/{name}")
 

@@ -239,7 +239,19 @@ def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: lis
     fewest = min((len(one["series"]) for one in judged["transmissions"]), default=done)
     if fewest < LEAST:
         return f"Too few recordings to judge a change: {fewest}, of {LEAST} or more."
+    if judged["effects"]:
+        return f"Steady in the last recording; before it {_earlier(judged['effects'])}."
     return "Steady."
+
+
+def _earlier(effects: list[dict[str, Any]]) -> str:
+    """What recordings before a sufficient one lacked, significant or not."""
+    each = [
+        f"{' or '.join(map(in_words, one['names'][:2]))} ({spaced(one['location'])}) was missing in "
+        f"{one['recordings']} of {one['of']}"
+        for one in effects
+    ]
+    return ", ".join(each)
 
 
 def _found(rows: list[dict[str, Any]]) -> str:

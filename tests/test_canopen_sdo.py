@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import can
 import pytest
 from canopenkit import Item, Slave, Wire, drive_objects
@@ -7,6 +9,7 @@ from drivelink.canopen.guard import ForbiddenFrameError, SilentBus, check_frame
 from drivelink.canopen.pdo import read_optional
 from drivelink.canopen.sdo import Read, SdoTimeout, Session, Write, abort_text, read_number
 from drivelink.errors import BusError, DriveError
+from drivelink.jointfile import BusSection
 
 
 def read(node, index, subindex=0):
@@ -164,3 +167,19 @@ def test_a_silent_bus_sends_nothing():
         assert other.recv(0.02) is None
         other.send(can.Message(arbitration_id=0x181, is_extended_id=False))
         assert silent.recv(0.5).arbitration_id == 0x181
+
+
+def test_a_bus_that_never_rests_keeps_no_request_from_its_timeout():
+    """A device that babbles without end held up the start for ever."""
+    babble = can.Message(arbitration_id=0x181, data=bytes(8), is_extended_id=False)
+    bus = SimpleNamespace(send=lambda _frame: None, recv=lambda _timeout: babble)
+    with pytest.raises(SdoTimeout):
+        run_program(read(5, 0x6076), bus, BusSection(sdo_timeout_s=0.05))
+
+
+def test_what_python_can_says_of_a_bus_that_fails_is_one_line():
+    def recv(_timeout):
+        raise can.CanOperationError("Failed to receive: 'zz'  Traceback (most recent call last):\n  File …\n")
+
+    with pytest.raises(BusError, match=r"^the bus cannot be read: Failed to receive: 'zz'$"):
+        run_program(read(5, 0x6076), SimpleNamespace(send=lambda _frame: None, recv=recv))

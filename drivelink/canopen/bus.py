@@ -226,7 +226,12 @@ def _reason(error: BaseException) -> str:
         if number in _REASONS:
             return _REASONS[number]
         cause = cause.__cause__ or cause.__context__
-    return " ".join(str(error).split()) or type(error).__name__
+    return one_line(str(error)) or type(error).__name__
+
+
+def one_line(text: str) -> str:
+    """Return a message in one line; some of python-can's contain a traceback."""
+    return " ".join(text.partition("Traceback (most recent call last)")[0].split())
 
 
 @contextlib.contextmanager
@@ -272,7 +277,7 @@ def sender(bus: FrameBus) -> Callable[[int, bytes], None]:
             if error.error_code in _QUEUE_FULL or "buffer full" in str(error):
                 logger.debug("frame 0x%03X is lost: the transmit queue is full", cob_id)
                 return
-            raise BusError(f"frame 0x{cob_id:03X} cannot be sent: {error}") from error
+            raise BusError(f"frame 0x{cob_id:03X} cannot be sent: {one_line(str(error))}") from error
 
     return send
 
@@ -300,10 +305,8 @@ def run_program(
         if idle is not None:
             idle()
         message = receive(bus, 0.0 if idle is not None else POLL_S)
-        while message is not None:
-            if is_canopen(message):
-                session.feed(message.arbitration_id, bytes(message.data), time.monotonic())
-            message = receive(bus, 0.0)
+        if message is not None and is_canopen(message):
+            session.feed(message.arbitration_id, bytes(message.data), time.monotonic())
     return session.result
 
 
@@ -340,4 +343,4 @@ def receive(bus: FrameBus, timeout_s: float) -> can.Message | None:
     try:
         return bus.recv(timeout_s)
     except (can.CanError, OSError) as error:
-        raise BusError(f"the bus cannot be read: {error}") from error
+        raise BusError(f"the bus cannot be read: {one_line(str(error))}") from error

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import can
 
-from drivelink.canopen.bus import received_ns, server_has_gone
+from drivelink.canopen.bus import one_line, received_ns, server_has_gone
 
 OVERFLOW = "receive overflow"  # key of `FrameSource.errors`: frames lost because they were not read in time
 MOST_FRAMES = 256  # limit per call, so that a babbling node cannot block the loop
@@ -55,7 +55,7 @@ class BusLostError(Exception):
     """
 
     def __init__(self, reason: str) -> None:
-        super().__init__(" ".join(reason.partition("Traceback (most recent call last)")[0].split()))
+        super().__init__(one_line(reason))
 
 
 class FrameSource:

@@ -84,7 +84,7 @@ def identify(
     """
     joint = fit_joint(record, model, bandwidth_rad_s)
     fits = transmission_fits(joint)
-    notes = [*joint.doubts, *wider(joint.surplus)]
+    notes = [*joint.doubts, *joint.problem.clipped, *wider(joint.surplus)]
     motors = tuple(
         replace(_fitted(motor, one), effects=motor.effects)
         if motor.flexible and not one.excited  # the readings' errors show through the spring

@@ -12,9 +12,12 @@ import pytest
 from drivelink import jointfile
 from drivelink.errors import JointFileError
 from estimator.batch import fit
+from estimator.diagnosis import diagnose
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.problem import Problem
+from estimator.gate import at_limit
+from estimator.identify import identify
 from estimator.model import JointModel
 from estimator.sample import SIGMA_95, FloatArray, Record
 
@@ -71,6 +74,47 @@ def test_an_effect_that_moves_the_stiffness_is_in_the_interval_of_a_fit():
         k, std = found.parameters["k_nm_rad"], found.std["k_nm_rad"]
         assert isinstance(k, float) and isinstance(std, float)
         assert 0.04 < k / kit.STIFFNESS - 1.0 < SIGMA_95 * std / kit.STIFFNESS
+
+
+def test_a_torque_gain_that_drifts_is_in_the_interval_of_a_fit_and_a_healthy_drive_widens_none():
+    """The inertias follow the gain, and with them the stiffness."""
+    (record,) = kit.World([{}]).run()
+    gain = 1.0 + 0.1 * np.expm1(-np.arange(len(record)) * kit.PERIOD_S / 4.0)
+    warm = replace(record, motor_torque_nm=record.motor_torque_nm / gain[:, None])
+    off, half = [], []
+    for one in (record, warm):
+        (found,) = fit(one, kit.model())
+        k, std = found.parameters["k_nm_rad"], found.std["k_nm_rad"]
+        assert isinstance(k, float) and isinstance(std, float)
+        off.append(k / kit.STIFFNESS - 1.0)
+        half.append(SIGMA_95 * std / kit.STIFFNESS)
+    assert half[0] < 0.005
+    assert 0.04 < off[1] < half[1] < 0.3
+
+
+def test_where_a_torque_rests_on_its_limit_more_may_have_acted():
+    """Taken as it is, it makes a stiffness 3 % wrong and a friction that is not there."""
+    (record,) = kit.World([{}]).run()
+    torque = record.motor_torque_nm
+    limit = 0.8 * np.max(np.abs(torque))
+    clipped = replace(record, motor_torque_nm=np.clip(torque, -limit, limit))
+    found = diagnose(clipped, kit.model())
+    assert found.verdict == "sufficient"
+    assert any("as if clipped" in note for note in found.notes)
+    identified = identify(clipped, kit.model())
+    assert any("as if clipped" in note for note in identified.notes)
+    k = identified.fits[0].parameters["k_nm_rad"]
+    assert k == pytest.approx(kit.STIFFNESS, rel=0.002)
+
+
+def test_a_torque_that_is_often_at_its_limit_is_as_it_is():
+    """So is one that passes its peak within what a line bridges."""
+    (record,) = kit.World([{}], seconds=2.0).run()
+    assert not len(at_limit(record))
+    assert not len(at_limit(replace(record, motor_torque_nm=np.sign(record.motor_torque_nm))))
+    few = record.motor_torque_nm.copy()
+    few[100:105] = 2.0 * np.max(few)
+    assert at_limit(replace(record, motor_torque_nm=few)).tolist() == [[100, 104]]
 
 
 def test_an_inertia_moves_as_far_as_it_is_declared_unsure():

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.choices import choice, rate, whole
+from estimator.choices import choice, least_rows, rate, whole
 from estimator.diagnosis.spectral import Band, Spectrum, lowpass
 from estimator.effects import Coordinates
+from estimator.gate import at_limit
 from estimator.model import JointModel, LinkDynamics
 from estimator.sample import FloatArray, Record
 
@@ -65,6 +66,7 @@ class Signals:
 
     Attributes:
         resolution_rad: of each motor's deflection: one count of each of its encoders.
+        clipped: share of the samples whose torque rests on its limit, which no row is near.
         memo: columns that depend on the motors' motion alone, by effect and shape (`candidates.columns`).
     """
 
@@ -94,6 +96,7 @@ class Signals:
         rows_step = max(1, int(1.0 / (self.light.period_s * rate() * bandwidth_hz)))
         self.narrow = Band(self.light.kept, self.light.period_s, rows_step, margin)
         self.response = lowpass(self.narrow.frequency_hz, bandwidth_hz)
+        self.clipped = 0.0
         self.keep = self._rows(record, sequence, margin)
         self.memo: dict[tuple[object, ...], FloatArray] = {}
         self._smooth = light_response(self)
@@ -142,14 +145,25 @@ class Signals:
         return true, velocity, (acceleration - bend * velocity**2) / slope
 
     def _rows(self, record: Record, sequence: NDArray[np.int64], edge: float) -> NDArray[np.bool_]:
-        """Rows away from the ends and from gaps by so many seconds."""
+        """Rows so many seconds away from ends and gaps and, if enough are left, from clipped torques."""
         time = np.arange(self.narrow.kept) * self.narrow.period_s
         end = (self.samples - 1) * record.period_s
-        keep = (time >= edge) & (time <= end - edge)
+
+        def away(spans: NDArray[np.int64]) -> NDArray[np.bool_]:
+            first, last = spans.T * record.period_s
+            near = np.zeros(len(time) + 1)
+            np.add.at(near, np.searchsorted(time, first - edge), 1.0)
+            np.add.at(near, np.searchsorted(time, last + edge, side="right"), -1.0)
+            return np.asarray(np.cumsum(near[:-1]) == 0.0)
+
         gaps = np.flatnonzero(np.diff(sequence) > whole("bridged"))
-        for before, after in zip(sequence[gaps], sequence[gaps + 1], strict=True):
-            keep &= (time < before * record.period_s - edge) | (time > after * record.period_s + edge)
-        return keep
+        keep = (time >= edge) & (time <= end - edge) & away(sequence[np.stack([gaps, gaps + 1], axis=1)])
+        limits = at_limit(record)
+        clear = keep & away(sequence[limits])
+        if not len(limits) or np.count_nonzero(clear) < least_rows():
+            return keep
+        self.clipped = float(np.sum(np.diff(limits) + 1)) / len(record)
+        return clear
 
     @functools.cached_property
     def rounding_rad(self) -> tuple[float, ...]:

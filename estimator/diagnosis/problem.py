@@ -25,6 +25,7 @@ from estimator.diagnosis.regression import Regression
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.model import JointModel
+from estimator.reasons import percent
 from estimator.sample import FloatArray, Record
 
 __all__ = ["Problem", "stretches"]
@@ -106,6 +107,17 @@ class Problem:
     def period_s(self) -> float:
         """The longest sampling period."""
         return max(signals.period_s for signals in self.signals)
+
+    @property
+    def clipped(self) -> list[str]:
+        """One sentence on torques at their limit, if there are such."""
+        share = max(signals.clipped for signals in self.signals)
+        if not share:
+            return []
+        return [
+            f"the torque rests on its largest or smallest value in {percent(share, 1)} of the samples, as if "
+            "clipped: what is near is left out"
+        ]
 
     def unit_of(self, term: Term, name: str) -> float:
         """Return a nonlinear parameter's unit per unit of its slot."""

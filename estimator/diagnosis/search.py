@@ -294,26 +294,41 @@ class Search:
             effect: design effect of the rows (`design_effects`).
 
         Returns:
-            (k, k), each effect at its most promising shape. Excluded are, in a fit, the torque's scale, which
-            is the anchor, and, unless the data support them, effects that change the transmission's curve,
-            which are another model.
+            (k, k), each effect at its most promising shape. Excluded are, unless the data support them,
+            effects that change the transmission's curve, which are another model, and, in a fit, those of the
+            drive; its constant scale is the anchor.
         """
         families: dict[tuple[object, ...], FloatArray] = {}
         nothing = np.zeros_like(parent.posterior.covariance)
         odds, apart = [0.0], [nothing]
         for one in self._library_beside(parent):
             candidate = one.candidate
-            if self.problem.calibrating and candidate.kind.channel == "motor_torque":
-                continue
+            drive = self.problem.calibrating and candidate.kind.channel == "motor_torque"
             best = one.independent(effect)
-            odds.append(best.gain - math.log(one.points) - self.held.price)
-            apart.append(np.outer(best.change, best.change) if math.isfinite(best.gain) else nothing)
-            more = nothing if candidate.bends else best.covariance
+            if drive and (candidate.kind.name == "torque_constant" or best.gain <= 0.0):
+                continue
+            gain, change = self._refitted(parent, one, effect) if drive else (best.gain, best.change)
+            odds.append(gain - math.log(one.points) - self.held.price)
+            apart.append(np.outer(change, change) if math.isfinite(gain) else nothing)
+            more = nothing if candidate.bends or drive else best.covariance
             _, *family = candidate.family  # either side of the motor's balance is the same to it
             before = families.get(tuple(family), nothing)
             families[tuple(family)] = max(more, before, key=lambda x: float(x[place, place]))
         between = np.tensordot(softmax(odds), apart, axes=1)
         return np.asarray(sum(families.values(), between))
+
+    def _refitted(self, parent: Fitted, one: _Tried, effect: float) -> tuple[float, FloatArray]:
+        """(gain of evidence, change of x) by an effect of a drive.
+
+        A linear step would shrink the torque that it explains.
+        """
+        child = self._grown(parent, Term(one.candidate, dict(one.values)))
+        then, now = (
+            {slot[:-1]: slot.taken + float(x) for slot, x in zip(h.slots, h.posterior.x, strict=True)}
+            for h in (parent, child)
+        )
+        gain = child.evidence(parent) - parent.posterior.evidence
+        return min(gain, gain / effect), np.array([now.get(key, x) - x for key, x in then.items()])
 
     def _library_beside(self, parent: Fitted) -> Iterator[_Tried]:
         """All additional effects, linearised, each at the most promising point of its grid."""

@@ -150,7 +150,7 @@ class Judge:
             transmissions = tuple(Refitted(one.model, {}, {}) for one in transmissions)
             unsure = ["no stiffness is reported: what is unexplained is in the spring's torque or deflection"]
         sides = self._sides(before, after) if judged.verdict in ("effect", "unexplained") else []
-        notes = [*judged.notes, *unsure, *self._doubts(effects), *sides, *wider(surplus)]
+        notes = [*judged.notes, *unsure, *self._doubts(effects), *sides, *problem.clipped, *wider(surplus)]
         aligned = alignment_of(problem, after, effects, surplus)
         return Diagnosis(
             verdict=judged.verdict,

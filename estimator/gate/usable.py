@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.choices import choice, whole
 from estimator.errors import EstimatorError
@@ -13,7 +14,7 @@ from estimator.model import JointModel
 from estimator.reasons import percent
 from estimator.sample import FloatArray, Record
 
-__all__ = ["check", "is_held", "without_hold"]
+__all__ = ["at_limit", "check", "is_held", "without_hold"]
 
 _ABSURD = 1.0 / np.finfo(float).eps  # where numbers are no longer told apart by one unit
 
@@ -76,6 +77,22 @@ def _stands(x: FloatArray) -> bool:
     """Whether a reading stays within a few counts, and on one of them nearly always."""
     changes = np.count_nonzero(np.diff(x))
     return bool(changes < 0.005 * (len(x) - 1) and len(np.unique(x)) < 4)
+
+
+def at_limit(record: Record) -> NDArray[np.int64]:
+    """Return (k, 2) first and last row of stretches where a torque rests on its largest or smallest value.
+
+    They are longer than what a line bridges. A drive or a recorder clips there: more may have acted. A torque
+    that is often there, as that of a motor that is switched, is as it is.
+    """
+    made: list[NDArray[np.int64]] = []
+    for torque in record.motor_torque_nm.T:
+        at = np.stack([torque == np.max(torque), torque == np.min(torque)])
+        turns = [np.flatnonzero(np.diff(x, prepend=False, append=False)).reshape(-1, 2) for x in at]
+        runs = np.concatenate(turns) - np.array([0, 1])
+        if np.mean(at[0] | at[1]) <= choice("gaps"):
+            made.append(runs[runs[:, 1] - runs[:, 0] >= whole("bridged")])
+    return np.concatenate([np.zeros((0, 2), dtype=np.int64), *made])
 
 
 def is_held(record: Record, model: JointModel) -> bool:

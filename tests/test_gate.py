@@ -24,6 +24,7 @@ from drivelink.jointfile import parse
 from drivelink.recording.corrections import corrections
 from estimator import JointModel, Motor, Record, Transmission
 from estimator.gate import Change, Discrepancy, examine, judge
+from estimator.gate.causes import causes
 from estimator.identify import identify
 from sim.cases import case
 from sim.world import record
@@ -98,6 +99,16 @@ def test_radians_that_were_taken_for_degrees_are_named(channel):
     factors = {channel: 1.0 / DEGREE}
     judgement = judge(gatekit.faulty(drawn.record, factors), drawn.model)
     assert named(list(judgement.findings), factors), judgement
+
+
+@pytest.mark.parametrize(("ratio", "named"), [(1.0, False), (-0.8, False), (57.3, True), (None, True)])
+def test_positions_that_are_alike_are_not_called_of_different_units(ratio, named):
+    """A drive that clips what it is told made radians of a link position that follows the motor's to 1 %."""
+    model = gatekit.draw("soft", 0).model
+    blamed = {frozenset(one.channels) for one in causes(model, True, [ratio]) if one.kind in ("unit", "gear")}
+    assert ({"link_position"} in blamed) is named
+    assert ({"motor1_position"} in blamed) is named
+    assert {"link_position", "motor1_position"} in blamed
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,15 @@ def causes(model: JointModel, linked: bool, ratios: Sequence[float | None]) -> l
         found += _gears(name, motor.gear_ratio, ratio, linked)
         any_inertia = (Change(f"{name}_inertia", math.inf),)
         found.append(Cause("inertia", "is not the declared one", any_inertia, choice("free_inertia")))
-    return found
+    return [cause for cause in found if not any(_parts(cause, i, x) for i, x in enumerate(ratios))]
+
+
+def _parts(cause: Cause, motor: int, ratio: float | None) -> bool:
+    """Whether a correction makes positions of different sizes that are alike as they are read."""
+    own, alike = scales([cause], motor), math.log(choice("declared_factor"))
+    if not ratio or abs(math.log(abs(ratio))) > alike:
+        return False
+    return abs(math.log(abs(own.position / own.link))) > alike
 
 
 def _all(channels: Sequence[str], factor: float) -> tuple[Change, ...]:

@@ -225,6 +225,11 @@ def test_a_joint_that_lacked_an_effect_in_some_nights_is_not_merely_steady():
     assert sentence(*rows) == said and said in page(summarise(rows, 0.05))
 
 
+def test_a_power_of_ten_on_an_axis_is_written_as_elsewhere():
+    drawn = page(summarise([night("elbow", k, 4e6, []) for k in range(8)], 0.05))
+    assert ">4e6<" in drawn and "e+0" not in drawn
+
+
 def test_on_a_terminal_the_sentence_of_a_joint_breaks_between_words(tmp_path, monkeypatch, capsys):
     nights = [night("elbow", k, 150.0, ["coulomb_friction@motor"]) for k in range(2)]
     append(tmp_path, *({**row(str(k)), **one, "id": str(k)} for k, one in enumerate(nights)))

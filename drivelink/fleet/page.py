@@ -245,7 +245,7 @@ def _axes(frame: _Frame, height: float) -> str:
     for value in ticks.tick_values(frame.low, frame.high):
         if not frame.low <= value <= frame.high:
             continue
-        y, text = frame.y(value), f"{value:.6g}".replace("e-0", "e−").replace("-", "−")
+        y, text = frame.y(value), f"{value:.6g}".replace("e+0", "e").replace("e-0", "e−").replace("-", "−")
         parts.append(f'<line class="grid" x1="{frame.left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text x="{frame.left - 8}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
     first, last = (datetime.fromtimestamp(t, UTC).date() for t in (frame.begin, frame.end))

@@ -179,7 +179,10 @@ class Comparison:
         figure, all_axes = plots.new_figure(rows=2, width=_WIDTH, height=2.0)
         both = [self.residuals(side, run) for run in runs]
         for axes, title, ones in zip(
-            all_axes, ("with itself", "with the motor torque"), zip(*both, strict=True), strict=True
+            all_axes,
+            ("residual with itself", "residual with motor torque"),
+            zip(*both, strict=True),
+            strict=True,
         ):
             curves = {a: plots.PlotCurve(one.lag_s, one.value) for a, one in zip("AB", ones, strict=True)}
             plots.xy(axes, curves, "lag / s", "correlation", title)

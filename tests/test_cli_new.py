@@ -1,3 +1,4 @@
+import errno
 import io
 import re
 
@@ -125,6 +126,19 @@ def test_the_examples_are_copied_once(tmp_path, capsys):
     assert (tmp_path / "examples" / "close_the_loop.py").exists()
     assert main(["new", "--examples", str(tmp_path)]) == 2
     assert "is there already" in capsys.readouterr().err
+
+
+def test_examples_on_a_full_disk_are_one_line_and_none(tmp_path, monkeypatch, capsys):
+    def full(source, target, **_):
+        raise OSError(errno.ENOSPC, "No space left on device", source, None, target)
+
+    monkeypatch.setattr("shutil.copyfile", full)
+    assert main(["new", "--examples", str(tmp_path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert (
+        line.startswith("drivelink new: --examples: [Errno 28] No space left on device") and len(line) < 400
+    )
+    assert not list(tmp_path.iterdir())
 
 
 def test_every_line_that_is_commented_out_is_valid_too(tmp_path):

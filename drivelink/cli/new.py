@@ -20,7 +20,7 @@ from drivelink.canopen.bus import open_bus
 from drivelink.canopen.newfile import Answers, answers_from_bus, joint_text
 from drivelink.canopen.scan import identify, scan
 from drivelink.cli import add_number
-from drivelink.errors import UsageError
+from drivelink.errors import DrivelinkError, UsageError
 from drivelink.files import check_target, write_whole
 from drivelink.jointfile import BusSection, parse
 
@@ -114,6 +114,7 @@ def _examples(folder: Path) -> Path:
 
     Raises:
         UsageError: they are not installed, or the folder is there already.
+        DrivelinkError: they cannot be written; nothing of them is left.
     """
     shipped = Path(sysconfig.get_path("data"), "share", "drivelink", "examples")
     source = next((p for p in (shipped, Path(__file__).parents[2] / "examples") if p.is_dir()), None)
@@ -122,7 +123,11 @@ def _examples(folder: Path) -> Path:
         raise UsageError("--examples: expected them beside the installation, there are none")
     if target.exists():
         raise UsageError(f"--examples: {target} is there already")
-    shutil.copytree(source, target, ignore=shutil.ignore_patterns("target", "__pycache__"))
+    try:
+        shutil.copytree(source, target, ignore=shutil.ignore_patterns("target", "__pycache__"))
+    except shutil.Error as error:  # of every file; the first is enough
+        shutil.rmtree(target, ignore_errors=True)
+        raise DrivelinkError(f"--examples: {error.args[0][0][2]}") from error
     return target
 
 

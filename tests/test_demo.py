@@ -113,6 +113,13 @@ def test_a_loop_that_stays_open_says_why(pressed, why, monkeypatch):
     assert console.export_text().splitlines()[-1] == why
 
 
+def test_a_loop_whose_time_is_over_before_its_joint_runs_has_not_ended_unexpectedly(capsys):
+    assert cli.main(["demo", "--case", "friction", "--headless", "--seconds", "0.1"]) == 1
+    captured = capsys.readouterr()
+    assert "the time is over (--seconds): there was no model alarm" in captured.out
+    assert "unexpectedly" not in captured.err
+
+
 def closing(comparison: Comparison) -> str:
     console = Console(width=100, record=True, file=io.StringIO())
     show([closing_section("vsa-ii", comparison, SUMMARY, 1150, 1e-3)], console)

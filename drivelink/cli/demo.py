@@ -97,8 +97,8 @@ def _closed_loop(args: argparse.Namespace, console: Console, *, live: bool) -> i
         ):
             interrupted = run.follow(rig, subscription)
     if run.summary is None:
-        if interrupted:
-            return 130
+        if interrupted or run.over:
+            return 130 if interrupted else 1
         raise DrivelinkError("the simulated drive and the daemon ended unexpectedly")
     document = closedloop.result(args.case, run, run.summary)
     if args.json:

@@ -94,6 +94,7 @@ class ClosedLoop(DemoRun):
         self.times: dict[str, float] = {}
         self.offer: Proposal | None = None  # what was proposed, or None
         self.trial: Trial | None = None  # the residual after it, or None
+        self.over = False  # it has ended the rig itself
         self._path, self._case, self._yes = path, case, yes
         self._keys = Keys()
         self._limit_s = self._end_s = time.monotonic() + limit_s
@@ -128,7 +129,7 @@ class ClosedLoop(DemoRun):
             missing = next((text for step, text in _MISSING.items() if step not in self.times), "")
             if missing and self._end_s == self._limit_s:
                 self._say(f"the time is over (--seconds): {missing}")
-            self._end_s = math.inf
+            self._end_s, self.over = math.inf, True
             self._stop()
 
     def _read(self, found: Mapping[str, Any]) -> None:

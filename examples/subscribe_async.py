@@ -4,6 +4,7 @@ python examples/subscribe_async.py [JOINT,JOINT… [ENDPOINT [SECONDS]]]
 """
 
 import asyncio
+import signal
 import sys
 
 import drivelink
@@ -28,4 +29,6 @@ async def main(joints: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seco
 
 
 if __name__ == "__main__":
+    for ending in (signal.SIGINT, signal.SIGPIPE):  # Ctrl-C and `| head` end it without a traceback
+        signal.signal(ending, signal.SIG_DFL)
     asyncio.run(main(*sys.argv[1:]))

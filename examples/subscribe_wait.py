@@ -3,6 +3,7 @@
 python examples/subscribe_wait.py [JOINT [ENDPOINT [SECONDS]]]
 """
 
+import signal
 import sys
 import time
 
@@ -36,4 +37,6 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
 
 
 if __name__ == "__main__":
+    for ending in (signal.SIGINT, signal.SIGPIPE):  # Ctrl-C and `| head` end it without a traceback
+        signal.signal(ending, signal.SIG_DFL)
     main(*sys.argv[1:])

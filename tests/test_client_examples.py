@@ -5,6 +5,7 @@ import os
 import re
 import runpy
 import shutil
+import signal
 import subprocess
 from contextlib import nullcontext
 from pathlib import Path
@@ -44,6 +45,19 @@ def run(*command, **options):
 def test_the_python_examples_run(daemon, name, expected, more):
     with python(EXAMPLES / name, "elbow", daemon, more) as process:
         assert any(re.search(expected, line) for line in process.stdout)
+
+
+@pytest.mark.parametrize("name", ["subscribe_latest.py", "subscribe_wait.py", "subscribe_async.py"])
+@pytest.mark.parametrize("ending", ["Ctrl-C", "closed pipe"])
+def test_a_python_example_ends_without_a_traceback(daemon, name, ending):
+    with python(EXAMPLES / name, "elbow", daemon, "30") as process:
+        process.stdout.readline()
+        if ending == "Ctrl-C":
+            process.send_signal(signal.SIGINT)
+        else:
+            process.stdout.close()
+            process.stdout = None
+        assert "Traceback" not in process.communicate(timeout=20)[1]
 
 
 def test_a_controller_in_its_safe_state_says_why(monkeypatch, capsys):

@@ -120,9 +120,9 @@ def test_a_loop_whose_time_is_over_before_its_joint_runs_has_not_ended_unexpecte
     assert "unexpectedly" not in captured.err
 
 
-def closing(comparison: Comparison) -> str:
+def closing(comparison: Comparison, received: int = 1150) -> str:
     console = Console(width=100, record=True, file=io.StringIO())
-    show([closing_section("vsa-ii", comparison, SUMMARY, 1150, 1e-3)], console)
+    show([closing_section("vsa-ii", comparison, SUMMARY, received, 1e-3)], console)
     return console.export_text()
 
 
@@ -135,7 +135,8 @@ def test_a_rig_that_ctrl_c_ended_first_has_not_ended_unexpectedly(interrupted, s
 
 def test_an_end_before_the_first_valid_cycle_gives_no_error():
     comparison = Comparison()
-    nothing = closing(comparison)
+    nothing, unheard = closing(comparison), closing(comparison, 0)
+    assert "no estimate came over zenoh" in unheard and "┏" not in unheard
     comparison.known(TruePoint(1, 2.0, 100.0))
     comparison.received(message(1, 9.0, 900.0, status=Status(0)))
     said = closing(comparison)

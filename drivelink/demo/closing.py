@@ -109,6 +109,8 @@ def closing(
     if errors.cycles:
         over = f"rms error: over all {errors.cycles} valid cycles ({errors.cycles * period_s:.1f} s), "
         lines.append(f"{over}relative to the truth's rms")
+    elif not received:
+        lines.append("no estimate came over zenoh: is there no loopback interface?")
     else:
         lines.append("no valid cycle, so no error: an estimate is valid after some seconds of motion")
     lines += [
@@ -119,7 +121,7 @@ def closing(
         held = f"the 95 % interval held the truth in {_percent(errors.covered)}"
         lines.append(f"{held} of {errors.cycles} valid cycles")
     grid = Grid(("", "truth", "estimate", "95 %", "rms error"), rows)
-    return Section(f"{case}: truth beside estimate", [grid, *map(Paragraph, lines)])
+    return Section(f"{case}: truth beside estimate", [*([grid] if rows else []), *map(Paragraph, lines)])
 
 
 def as_json(case: str, comparison: Comparison, summary: RunSummary, received: int) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import pytest
 
 from drivelink import jointfile
 from drivelink.errors import JointFileError
+from estimator import Effect
 from estimator.batch import fit
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.covariance import hac_covariance
@@ -115,6 +116,15 @@ def test_a_torque_that_is_often_at_its_limit_is_as_it_is():
     few = record.motor_torque_nm.copy()
     few[100:105] = 2.0 * np.max(few)
     assert at_limit(replace(record, motor_torque_nm=few)).tolist() == [[100, 104]]
+
+
+def test_a_declared_friction_errs_as_one_that_is_found():
+    """Its sign changes over another velocity than declared: a healthy joint "lacked" an encoder's delay."""
+    (record,) = kit.World([{"coulomb_nm": 2.0}], seconds=8.0).run()
+    friction = Effect(name="coulomb_friction", parameters={"torque_nm": 2.0, "smoothing_rad_s": 0.03})
+    exact = kit.model(linked=False)
+    found = diagnose(record, replace(exact, motors=(replace(exact.motors[0], effects=(friction,)),)))
+    assert found.verdict == "sufficient"
 
 
 def test_an_inertia_moves_as_far_as_it_is_declared_unsure():

@@ -218,8 +218,9 @@ def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
     monkeypatch.setattr(Held, "_relative", lambda _, floor: np.square(floor))
     held: Any = Held.__new__(Held)
     held.problem, law = SimpleNamespace(floor=choice("floor")), SimpleNamespace(floor=0.02)
+    held._laws, like = {}, {"terms": (), "families": frozenset(), "regression": law}
     rest, found = (
-        SimpleNamespace(squares=np.array(x), families=frozenset(), parameters=count, regression=law)
+        SimpleNamespace(squares=np.array(x), parameters=count, **like)
         for count, x in enumerate((before, after))
     )
     assert held.confirms(found, rest) is confirmed

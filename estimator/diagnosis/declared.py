@@ -7,11 +7,11 @@ import numpy as np
 from estimator.diagnosis.candidates import Candidate, columns
 from estimator.diagnosis.corrections import READINGS
 from estimator.diagnosis.frame import Corrections, Frame
-from estimator.effects import elements
+from estimator.effects import LIBRARY, elements
 from estimator.model import Effect, JointModel
 from estimator.sample import FloatArray
 
-__all__ = ["declared_corrections", "declared_torque"]
+__all__ = ["declared_corrections", "declared_laws", "declared_torque"]
 
 
 def declared_corrections(model: JointModel) -> Corrections:
@@ -38,15 +38,25 @@ def _sum(effects: tuple[Effect, ...], name: str, parameter: str) -> float:
     return sum(v[parameter] for e in effects if e.name == name for v in elements(e)[1])
 
 
-def declared_torque(frame: Frame) -> FloatArray:
-    """Return the contribution of the declared effects to the stacked balances."""
+def declared_torque(frame: Frame, *, laws: bool = False) -> FloatArray:
+    """Return the contribution of the declared effects to the balances; `laws`: of those with a shape."""
     total = np.zeros(frame.rows * frame.equations)
-    owners = [(i, effect) for i, motor in enumerate(frame.model.motors) for effect in motor.effects]
-    for motor, effect in [*owners, *((None, effect) for effect in frame.model.link_effects)]:
-        if effect.name in READINGS:
+    for candidate, effect in _declared(frame.model):
+        if effect.name in READINGS or (laws and not candidate.kind.nonlinear):
             continue
-        kind, each = elements(effect)
-        for values in each:
-            weights = tuple(values[name] for name in kind.linear)
-            total = total + columns(frame, Candidate(kind, motor), values, weights) @ np.array(weights)
+        for values in elements(effect)[1]:
+            weights = tuple(values[name] for name in candidate.kind.linear)
+            total = total + columns(frame, candidate, values, weights) @ np.array(weights)
     return total
+
+
+def declared_laws(model: JointModel) -> dict[object, int]:
+    """Return the number of parameters of each declared effect that has a shape, by its family."""
+    kinds = [candidate for candidate, _ in _declared(model) if candidate.kind.nonlinear]
+    return {one.family: len(one.kind.parameters) for one in kinds}
+
+
+def _declared(model: JointModel) -> list[tuple[Candidate, Effect]]:
+    owners = [(i, effect) for i, motor in enumerate(model.motors) for effect in motor.effects]
+    every = [*owners, *((None, effect) for effect in model.link_effects)]
+    return [(Candidate(LIBRARY[effect.name], motor), effect) for motor, effect in every]

@@ -13,6 +13,7 @@ from scipy.special import softmax
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import members
+from estimator.diagnosis.declared import declared_laws
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.problem import Problem, stretches
 from estimator.diagnosis.result import Errors
@@ -76,6 +77,7 @@ class Held:
         self.problem, self.other = problem, other
         self.price = math.log(max(len(members(problem.frames[0])), 1))  # log odds against any one effect
         alone = len(problem.records) == 1
+        self._laws = declared_laws(problem.model)
         self._labels = stretches(problem) if alone else problem.group // problem.equations
         self._memo: dict[int, tuple[Fitted, list[Residual], list[Residual]]] = {}
         self._squares: dict[int, FloatArray] = {}
@@ -141,10 +143,16 @@ class Held:
 
     def margin(self, found: Fitted, rest: Fitted) -> float:
         """Return how many times more than `confirms` asks for one model gains over another."""
-        floor = rest.regression.floor if _refines(found, rest) else self.problem.floor
+        floor = rest.regression.floor if self._refines(found, rest) else self.problem.floor
         fall = (self.squared(rest) - self.squared(found)) / float(np.mean(self._relative(floor)))
         both = found, rest
         return min(fall, _in_errors(self.scores(found, both) - self.scores(rest, both)))
+
+    def _refines(self, one: Fitted, other: Fitted) -> bool:
+        """Whether a model has laws of the same phenomena with more parameters, also than are declared."""
+        kinds = [t.candidate for t in one.terms]
+        declared = {c.family for c in kinds if len(c.kind.parameters) > self._laws.get(c.family, math.inf)}
+        return one.families <= other.families | declared and one.parameters > other.parameters
 
     def _preferred(self, found: Fitted, models: Sequence[Fitted]) -> list[bool]:
         """Whether each says more of the phenomena of the one found and held-out data surely ask for it, for
@@ -159,7 +167,7 @@ class Held:
             cost = other.log_prior(errors, self.price) - one.log_prior(errors, self.price)
             return _in_errors(gain) > choice("sure") and errors * float(np.mean(gain)) > cost
 
-        richer = [one for one in models if _refines(one, found) and beats(one, found)]
+        richer = [one for one in models if self._refines(one, found) and beats(one, found)]
         best = max(richer, key=lambda one: float(np.mean(self.scores(one))), default=found)
         return [one in richer and not beats(best, one) for one in models]
 
@@ -245,11 +253,6 @@ class Held:
         if self.other is not None or len(self.problem.records) < 2:
             return None
         return _errors(self.residuals(before)[k], self.residuals(after)[k])
-
-
-def _refines(one: Fitted, other: Fitted) -> bool:
-    """Whether a model has laws of the same phenomena with more parameters."""
-    return one.families <= other.families and one.parameters > other.parameters
 
 
 def _in_errors(gain: FloatArray) -> float:

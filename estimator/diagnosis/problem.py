@@ -269,20 +269,24 @@ class Problem:
         for _ in range(2):
             times = regression.autocorrelation_times(posterior.x)
             posterior = regression.solve(times, posterior)
-        if terms:
-            regression = replace(regression, floor=self._floor(regression, stack.slots, posterior.x))
+        laws = np.concatenate([declared_torque(f, laws=True) for f in frames])
+        if terms or (np.any(laws) and not self.calibrating):
+            regression = replace(regression, floor=self._floor(regression, stack.slots, posterior.x, laws))
             posterior = regression.solve(times, posterior)
         terms = _weighed(terms, stack.slots, posterior.x)
         slots = tuple(stack.slots)
         return Fitted(terms, base, corrections, slots, regression, times, posterior, extra, pinned)
 
-    def _floor(self, regression: Regression, slots: list[Slot], x: FloatArray) -> FloatArray:
-        """(groups,) noise floor: rounding, and the typical error of an effect's law."""
+    def _floor(
+        self, regression: Regression, slots: list[Slot], x: FloatArray, laws: FloatArray
+    ) -> FloatArray:
+        """(groups,) noise floor: rounding, and the typical error of an effect's law, be it declared."""
         effect = [j for j, s in enumerate(slots) if s.kind == "term" and LIBRARY[s.name].nonlinear]
         square = self.floor**2
         torque = regression.design[:, effect] @ x[effect]
         for g in range(len(square)):
-            square[g] += choice("law") ** 2 * float(np.mean(torque[self.group == g] ** 2))
+            mine = self.group == g
+            square[g] += choice("law") ** 2 * float(np.mean(torque[mine] ** 2) + np.mean(laws[mine] ** 2))
         return np.asarray(np.sqrt(square))
 
     def _moved(self, fitted: Fitted) -> tuple[tuple[Term, ...], Base, tuple[Corrections, ...]]:

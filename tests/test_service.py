@@ -2,13 +2,16 @@
 
 import re
 import shutil
+import socket
 import subprocess
 from pathlib import Path
 
 import pytest
 from canopenkit import joint_text
+from daemonkit import vsa_text
 
 from drivelink import cli
+from drivelink.cli import blackbox
 from drivelink.jointfile import parse
 from drivelink.systemd.unit import installation
 
@@ -114,3 +117,18 @@ def test_systemd_finds_the_unit_right_and_little_exposed(tmp_path, interface, ch
         assert done.returncode == 0, done.stdout + done.stderr
     level = re.search(r"exposure level .*: ([\d.]+)", done.stdout)
     assert level is not None and float(level[1]) <= 1.4
+
+
+def test_a_service_that_is_stopped_waits_for_its_black_box(tmp_path, monkeypatch):
+    """It writes what is pending for up to a minute; the unit's limit is five seconds."""
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setattr(
+        blackbox, "_start", lambda _command, *, quiet: subprocess.Popen(["cat"], stdin=subprocess.PIPE)
+    )
+    joint = parse(vsa_text() + '[recording]\nfolder = "kept"\n')
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(5.0)
+        with blackbox.black_box(joint, tmp_path / "elbow.toml"):
+            pass
+        assert manager.recv(100) == b"EXTEND_TIMEOUT_USEC=60000000"

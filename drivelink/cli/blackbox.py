@@ -24,6 +24,7 @@ from drivelink.loop.finding import folder_of
 from drivelink.loop.queue import Diagnoses
 from drivelink.plaintext import log_to_stderr
 from drivelink.recording.recorder import Recorder
+from drivelink.systemd.unit import notify
 
 _LOG = logging.getLogger("drivelink.recording")
 _NICE = 5  # the daemon goes first
@@ -49,6 +50,7 @@ def black_box(joint: JointFile, path: Path | None, *, quiet: bool = False) -> It
     finally:
         ended.set()
         keeper.join()
+        notify(f"EXTEND_TIMEOUT_USEC={_END_S * 1e6:.0f}")  # the daemon itself has ended
         process = running[-1]
         try:
             process.communicate(timeout=_END_S)

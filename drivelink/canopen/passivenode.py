@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import replace
+from functools import partial
 
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.layout import NodeLayout, Offer, Role, Signal
@@ -40,8 +41,8 @@ class PassiveNode:
         self.role, self._bus = role, bus
         self._sheet = load_eds(role.eds, role.node_id) if role.eds is not None else None
         self._units = {address for vendor in VENDORS.values() for address in unit_objects(role, vendor)}
-        self._followed = self._units.union(_COMMUNICATION, _STORED)
-        self.listener = SdoSniffer(self._interesting, bus.sdo_timeout_s)
+        followed = self._units.union(_COMMUNICATION, _STORED)
+        self.listener = SdoSniffer(partial(_interesting, followed), bus.sdo_timeout_s)
         self.seen_changes = -1
         self.state = (-1, False)  # changes and `being_mapped` after its last frame
         self.adopted: NodeLayout | None = None
@@ -51,11 +52,6 @@ class PassiveNode:
         self._identity: dict[Address, int] = {}
         self._offered: tuple[dict[Address, int], Offer | None] = {}, None  # by the units before it
         self.heard: dict[int, int] = {}  # lengths of frames with its predefined identifiers
-
-    def _interesting(self, index: int, subindex: int) -> bool:
-        if is_mapping((index, subindex)):
-            return subindex <= _MOST_ENTRIES
-        return (index, subindex) in self._followed
 
     def restart(self) -> None:
         """Handle a boot-up: mapping and parameters are the node's defaults again."""
@@ -256,6 +252,12 @@ class PassiveNode:
             f"{role.subject} ({role.key}): its mapping is not known: expected {master} to write it or read "
             f"it back while this listens, or {self._keys()} or eds in the joint file"
         ) + (f"; it sends {heard}" if heard else "")
+
+
+def _interesting(followed: Container[Address], index: int, subindex: int) -> bool:
+    if is_mapping((index, subindex)):
+        return subindex <= _MOST_ENTRIES
+    return (index, subindex) in followed
 
 
 def _sent(tpdos: Iterable[Tpdo]) -> tuple[Tpdo, ...]:

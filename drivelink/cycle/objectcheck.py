@@ -92,7 +92,8 @@ class _Node:
     @cached_property
     def sniffer(self) -> SdoSniffer:
         """Follows its transfers."""
-        return SdoSniffer(lambda *address: address in self.objects, self.timeout_s)
+        objects = self.objects  # not self: compiled code that holds what holds it would never be freed
+        return SdoSniffer(lambda *address: address in objects, self.timeout_s)
 
 
 def contradicted(

@@ -13,6 +13,7 @@ from daemonkit import vsa_text
 from drivelink import cli
 from drivelink.cli import blackbox
 from drivelink.jointfile import parse
+from drivelink.pubsub.session import FILES
 from drivelink.systemd.unit import installation
 
 UNIT = Path("etc/systemd/system/drivelink@elbow.service")
@@ -103,6 +104,7 @@ def test_a_home_installation_is_let_in_and_keys_come_as_credentials(monkeypatch)
     assert "IPAddressAllow=localhost 10.0.0.0/24\n" in unit
     assert "LoadCredential=daemon.key:/etc/ssl/private/daemon.key" in unit
     assert "DeviceAllow=char-ttyACM rw" in unit and "PrivateDevices=yes" not in unit
+    assert f"LimitNOFILE={FILES}\n" in unit
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import count, islice
-from typing import Any
+from typing import Any, NamedTuple
 
 from drivelink._core import Assembler
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal
@@ -43,8 +43,7 @@ class Mismatch:
     signal: Signal | None  # whose value differs; None: a unit
 
 
-@dataclass(frozen=True, slots=True)
-class _Answer:
+class _Answer(NamedTuple):
     """What a node has said of an object, and the numbers of the SYNCs before request and answer."""
 
     address: Address
@@ -166,11 +165,12 @@ class ObjectCheck:
         """Return whether an answer waits for the cycles that it is compared with."""
         return any(answer.address == one.address for answer in self._nodes[one.node].answers)
 
-    def request(self, node: int, data: bytes, now_s: float) -> None:
+    def request(self, node_id: int, data: bytes, now_s: float) -> None:
         """Process an SDO frame of a master."""
-        if node in self._nodes:
-            self._nodes[node].asked = self._nodes[node].assembler.sequence
-            self._nodes[node].sniffer.request(data, now_s)
+        node = self._nodes.get(node_id)
+        if node is not None:
+            node.asked = node.assembler.sequence
+            node.sniffer.request(data, now_s)
 
     def response(self, node_id: int, data: bytes, now_s: float) -> None:
         """Process an SDO frame of a node."""

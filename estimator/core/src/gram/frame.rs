@@ -4,7 +4,7 @@ use std::ops::{Index, IndexMut};
 
 use serde::{Deserialize, Serialize};
 
-use super::{COLUMNS, Gram, Matrix, Posterior, Row, Set, UNKNOWNS, Vector, dot, unknowns};
+use super::{COLUMNS, Gram, Matrix, PIVOT, Posterior, Row, Set, UNKNOWNS, Vector, dot, unknowns};
 
 /// What each unknown adds to a row's balance, and what they explain together.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -43,13 +43,23 @@ impl Frame {
     /// Dᵀ G D with `left` as the direction of index 0.
     #[must_use]
     pub fn reduce(&self, gram: &Gram) -> Reduced {
-        Reduced { sums: self.between(gram), noise: [[0.0; UNKNOWNS]; UNKNOWNS] }
+        Reduced { sums: self.sums(gram), noise: [[0.0; UNKNOWNS]; UNKNOWNS] }
     }
 
     /// The same, with the noise that is in the columns.
     #[must_use]
     pub fn reduce_noisy(&self, gram: &Gram, noise: &Gram) -> Reduced {
-        Reduced { sums: self.between(gram), noise: self.between(noise) }
+        Reduced { sums: self.sums(gram), noise: self.between(noise) }
+    }
+
+    /// What rounding leaves of a direction whose columns cancel is not of it: the sums stay positive definite.
+    fn sums(&self, gram: &Gram) -> Matrix {
+        let mut out = self.between(gram);
+        for j in unknowns(self.set) {
+            let size: f64 = (0..COLUMNS).map(|k| self.directions[j][k].abs() * gram.at(k, k).sqrt()).sum();
+            out[j][j] += PIVOT * size * size;
+        }
+        out
     }
 
     fn between(&self, gram: &Gram) -> Matrix {

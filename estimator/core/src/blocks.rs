@@ -105,7 +105,7 @@ pub struct Blocks {
     pub seen: [f64; 2],
     /// The functions that the spring's curve is a sum of.
     pub family: Family,
-    located: bool, // a zero elsewhere, so well that the balance can be linearised
+    located: bool, // the zero, so well that the balance can be linearised
     /// How far a lost zero is from where deflections are counted from, rad; 0: near.
     pub off: f64,
     /// Whether evidence chose a zero that is not the declared one.
@@ -169,7 +169,7 @@ impl Blocks {
             readings: Readings::default(),
             seen: [0.0; 2],
             family: Family::of(Some(&spring.law)),
-            located: false,
+            located: true,
             off: 0.0,
             moved: false,
             posterior: None,
@@ -186,10 +186,10 @@ impl Blocks {
 
     /// Forget rows and what they have taught: they are of other moments. A lost zero stays lost.
     pub fn relearn(&mut self) {
-        let lost = self.lost;
+        let (lost, located) = (self.lost, self.located);
         self.clear();
         if lost {
-            (self.lost, self.posterior) = (true, None);
+            (self.lost, self.located, self.posterior) = (true, located, None);
         }
     }
 
@@ -199,7 +199,7 @@ impl Blocks {
         self.waiting.clear();
         self.open = Gram::default();
         (self.posterior, self.frame) = (self.spring.declared_posterior(), None);
-        (self.oldest, self.moved, self.skipped, self.fitted) = (0, false, 0, false);
+        (self.oldest, self.moved, self.located, self.skipped, self.fitted) = (0, false, true, 0, false);
         self.end_doubt();
         self.unform();
         (self.noise.variance, self.own, self.torque, self.quick) = (f64::NAN, f64::NAN, f64::NAN, 0.0);
@@ -246,7 +246,7 @@ impl Blocks {
     #[must_use]
     pub fn is_unconfirmed(&self) -> bool {
         let nothing_before = self.carried.is_none() && !self.spring.is_anchored();
-        self.moved && !self.located
+        !self.lost && !self.located
             || self.ring.len() < FEWEST && (nothing_before || self.lost && !self.spring.is_constant())
     }
 

@@ -190,11 +190,12 @@ impl Blocks {
         self.located = true;
     }
 
-    /// Evidence has said where the zero is. One that is not the declared one is known when two blocks say so, and the
-    /// balance is linearised near it: a step of the iteration stays within a part of the motion.
+    /// Evidence has said where the zero is: it is known when two blocks say so, and the balance is linearised near it: a
+    /// step of the iteration stays within a part of the motion.
     pub(super) fn place_zero(&mut self, moved: bool, step: f64) {
-        if moved {
-            self.located = self.moved && f64::from(ZEROS) * step <= self.seen[1] - self.seen[0];
+        if !self.lost {
+            let near = f64::from(ZEROS) * step <= self.seen[1] - self.seen[0];
+            self.located = near && moved == self.moved;
         }
         self.moved = moved;
     }

@@ -2,7 +2,7 @@
 
 use super::Blocks;
 use crate::balance::Balance;
-use crate::choices::{BLOCKS, UNUSUAL, USEFUL};
+use crate::choices::{BLOCKS, FEWEST, UNUSUAL, USEFUL};
 use crate::gram::{UNKNOWNS, set};
 use crate::unknowns::{
     ASYMMETRY, CANDIDATES, CLIPS, CORNER, LATE, OFFSET, RATE, Reading, SOFT, STOPS, TORQUE_LATE, ZERO,
@@ -77,7 +77,7 @@ impl Blocks {
         let both_sides = !self.spring.is_searched() || self.seen[0] < 0.0 && 0.0 < self.seen[1];
         let bends = known.set & bending != 0 || self.spring.is_longer(known.set);
         let before = self.carried.as_ref().is_some_and(|carried| carried.set >> ZERO & 1 == 1);
-        let told = both_sides && !bends && (before || !self.are_few());
+        let told = both_sides && !bends && (before || self.ring.len() > FEWEST);
         if !straight && told {
             return 0.0;
         }

@@ -179,10 +179,16 @@ def test_the_torque_of_a_straight_line_is_not_valid_where_its_zero_or_the_torque
             ("quadratic", 5, -0.3109),
             ("quadratic", 5, -3.5073),
         ),
-        *(("vsa-ii", 0, 0.7), ("vsa-ii", 2, -1.1)),
+        *(
+            ("quadratic", 1, -0.1),
+            ("quadratic", 3, -1.0),
+            ("vsa-ii", 0, 0.5),
+            ("vsa-ii", 0, 0.7),
+            ("vsa-ii", 2, -1.1),
+        ),
     ],
 )
-def test_a_constant_torque_that_may_be_the_zero_s_is_not_believed_from_the_start(name, seed, off_rad):
+def test_a_zero_elsewhere_from_the_start_is_found_or_its_torque_not_believed(name, seed, off_rad):
     """Of a line, beside effects that bend the curve, far from the zero, by few rows, and beyond where a law ends."""
     moved = kit.motion(name, 12.0, seed=seed)
     own = [s.motor_position_rad for s in moved.samples]
@@ -193,6 +199,22 @@ def test_a_constant_torque_that_may_be_the_zero_s_is_not_believed_from_the_start
     estimates, _ = kit.play(kit.declared(name), samples)
     assert not np.any(kit.wrong(estimates, moved.stiffness_nm_rad))
     assert not np.any(kit.wrong_torque(estimates, moved.torque_nm))
+
+
+@pytest.mark.parametrize(("name", "seed", "off_rad"), [("quadratic", 0, -0.1), ("vsa-ii", 0, 0.5)])
+def test_a_zero_far_from_the_declared_one_is_found(name, seed, off_rad):
+    """By a third and by nearly half of the deflections' range: the iteration goes there, and not beyond."""
+    moved = kit.motion(name, 12.0, seed=seed)
+    own = [s.motor_position_rad for s in moved.samples]
+    samples = [
+        s._replace(motor_position_rad=(o[0] + off_rad, *o[1:]))
+        for s, o in zip(moved.samples, own, strict=True)
+    ]
+    estimates, estimator = kit.play(kit.declared(name), samples)
+    assert "deflection_offset" in estimator.undeclared()[0]
+    assert np.mean(estimates.valid[-8000:]) > 0.99
+    off = np.abs(estimates.stiffness_nm_rad / moved.stiffness_nm_rad - 1.0)
+    assert np.max(off[-8000:]) < 0.02
 
 
 def test_friction_at_rest_is_no_hysteresis():

@@ -26,13 +26,13 @@ impl Blocks {
     }
 
     /// The law is known over the deflections that the joint has had: near its end, or beyond it, no sum of few functions
-    /// is the law. Where the zero is lost, they were counted from elsewhere before.
+    /// is the law. Where the zero is elsewhere, they are not as far to either side.
     pub(super) fn fit_projection(&mut self) {
         let [low, high] = self.seen;
         if high <= low {
             return;
         }
-        let (low, high) = if self.lost {
+        let (low, high) = if self.is_elsewhere() {
             let (ends, zero) = (REACHED * self.spring.reach(), self.spring.zero);
             let more = (MARGIN - 1.0) * (high - low);
             ((low - more).max(-ends - zero), (high + more).min(ends - zero))
@@ -46,9 +46,8 @@ impl Blocks {
 
     /// Where a deflection goes further than any before, the law is fitted anew; whether its functions are others now.
     pub(super) fn follow(&mut self) -> bool {
-        let Some(projection) = self.projection.as_ref().filter(|_| !self.lost && self.frame.is_some()) else {
-            return false;
-        };
+        let follows = !self.is_elsewhere() && self.frame.is_some();
+        let Some(projection) = self.projection.as_ref().filter(|_| follows) else { return false };
         let [low, high] = self.seen;
         let (largest, end) = (high.max(-low), projection.nodes()[NODES - 1]);
         if !self.is_shaped() || largest <= end || end >= REACHED * self.spring.reach() {
@@ -66,7 +65,7 @@ impl Blocks {
     /// What has been learned of all but the spring is carried over; rows are sums of the functions before, and are
     /// forgotten. Whether that has been done.
     pub(super) fn reform(&mut self) -> bool {
-        if self.lost || self.moved || self.doubting {
+        if self.is_elsewhere() || self.doubting {
             return false;
         }
         self.fit_projection();
@@ -88,6 +87,11 @@ impl Blocks {
         self.fit_projection();
         self.restate();
         true
+    }
+
+    /// Whether the zero is not where it is declared, or lost.
+    fn is_elsewhere(&self) -> bool {
+        self.lost || self.moved
     }
 
     /// Whether no sum of few powers is the law, and functions near it are quickly had.

@@ -213,3 +213,27 @@ fn a_variance_below_zero_is_no_certainty() {
     assert_eq!(along(1.0, 1.0), f64::INFINITY);
     assert_eq!(along(0.0, 0.0), 0.0);
 }
+
+/// Powers of a deflection around a zero far from it cancel: what rounding leaves of them is no information.
+#[test]
+fn sums_of_directions_that_cancel_stay_positive_definite() {
+    let rows: Vec<Row> = (0..400)
+        .map(|k| {
+            let u = 1.0 + 0.1 * (f64::from(k) * 0.37).sin();
+            std::array::from_fn(|column| if column < 10 { u.powi(column as i32) } else { 0.0 })
+        })
+        .collect();
+    let mut frame = plain(0);
+    frame.set = set(1..6);
+    for (power, direction) in (5..10).zip(&mut frame.directions[1..6]) {
+        *direction = [0.0; COLUMNS];
+        let mut chosen = 1.0; // power over k
+        for k in 0..=power {
+            direction[k] = chosen * (-1.0_f64).powi((power - k) as i32);
+            chosen *= (power - k) as f64 / (k + 1) as f64;
+        }
+    }
+    let found = solve(&frame.reduce(&sum(&rows)), frame.set, &wide(), 1e-9).unwrap();
+    assert!(found.x.iter().all(|x| x.abs() < 1e12), "{:?}", found.x);
+    assert!(found.log_evidence < 0.0);
+}

@@ -170,6 +170,16 @@ def test_the_torque_of_a_straight_line_is_not_valid_where_its_zero_or_the_torque
         )
 
 
+def with_zero_moved(name, seed, off_rad):
+    """A packaged motion whose motor 1 counts from elsewhere, and what the estimator makes of it."""
+    motion = kit.motion(name, 12.0, seed=seed)
+    samples = [
+        s._replace(motor_position_rad=(s.motor_position_rad[0] + off_rad, *s.motor_position_rad[1:]))
+        for s in motion.samples
+    ]
+    return motion, *kit.play(kit.declared(name), samples)
+
+
 @pytest.mark.parametrize(
     ("name", "seed", "off_rad"),
     [
@@ -190,13 +200,7 @@ def test_the_torque_of_a_straight_line_is_not_valid_where_its_zero_or_the_torque
 )
 def test_a_zero_elsewhere_from_the_start_is_found_or_its_torque_not_believed(name, seed, off_rad):
     """Of a line, beside effects that bend the curve, far from the zero, by few rows, and beyond where a law ends."""
-    moved = kit.motion(name, 12.0, seed=seed)
-    own = [s.motor_position_rad for s in moved.samples]
-    samples = [
-        s._replace(motor_position_rad=(o[0] + off_rad, *o[1:]))
-        for s, o in zip(moved.samples, own, strict=True)
-    ]
-    estimates, _ = kit.play(kit.declared(name), samples)
+    moved, estimates, _ = with_zero_moved(name, seed, off_rad)
     assert not np.any(kit.wrong(estimates, moved.stiffness_nm_rad))
     assert not np.any(kit.wrong_torque(estimates, moved.torque_nm))
 
@@ -204,13 +208,7 @@ def test_a_zero_elsewhere_from_the_start_is_found_or_its_torque_not_believed(nam
 @pytest.mark.parametrize(("name", "seed", "off_rad"), [("quadratic", 0, -0.1), ("vsa-ii", 0, 0.5)])
 def test_a_zero_far_from_the_declared_one_is_found(name, seed, off_rad):
     """By a third and by nearly half of the deflections' range: the iteration goes there, and not beyond."""
-    moved = kit.motion(name, 12.0, seed=seed)
-    own = [s.motor_position_rad for s in moved.samples]
-    samples = [
-        s._replace(motor_position_rad=(o[0] + off_rad, *o[1:]))
-        for s, o in zip(moved.samples, own, strict=True)
-    ]
-    estimates, estimator = kit.play(kit.declared(name), samples)
+    moved, estimates, estimator = with_zero_moved(name, seed, off_rad)
     assert "deflection_offset" in estimator.undeclared()[0]
     assert np.mean(estimates.valid[-8000:]) > 0.99
     off = np.abs(estimates.stiffness_nm_rad / moved.stiffness_nm_rad - 1.0)

@@ -107,7 +107,7 @@ def read(*stiffness):
 
 
 def held_back(torque, by):
-    """A torque that is read so many periods late, or by "lag" behind a drive's filter of 20 ms."""
+    """A torque that is read so many periods late or before it acts, or by "lag" behind a drive's filter of 20 ms."""
     if by == "lag":
         return lfilter([1.0 - np.exp(-T / 0.02)], [1.0, -np.exp(-T / 0.02)], torque, axis=0)
     moments = np.arange(len(torque))
@@ -118,10 +118,13 @@ def held_back(torque, by):
     ("by", "names", "most"),  # what has passed a filter, and is brought up again, is noisier
     [
         (0.5, [], 0.01),
-        *((by, ["torque_delay"], most) for by, most in ((3.0, 0.01), (6.0, 0.01), ("lag", 0.02))),
+        *(
+            (by, ["torque_delay"], most)
+            for by, most in ((3.0, 0.01), (6.0, 0.01), ("lag", 0.02), (-2.0, 0.01), (-5.0, 0.01))
+        ),
     ],
 )
-def test_a_torque_that_is_read_late_is_no_other_effect(by, names, most):
+def test_a_torque_that_is_read_late_or_early_is_no_other_effect(by, names, most):
     truth, record, joint = read(150.0, 8000.0)
     torque = held_back(record.motor_torque_nm, by)
     estimates, estimator = kit.play(joint, replace(record, motor_torque_nm=torque).samples())

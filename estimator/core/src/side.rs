@@ -337,10 +337,11 @@ impl Side {
         beyond.then(|| Shift::Late((late / self.period).round()))
     }
 
-    /// Names of the effects that nobody declared. A drive that samples or averages its torque is a period late.
+    /// Names of the effects that nobody declared. A drive that samples or averages its torque is a period late, and one
+    /// that reports what it is told to make is as early.
     pub fn undeclared(&self) -> impl Iterator<Item = &'static str> {
         let (late, std) = self.blocks.torque_lateness();
-        let late = late - self.period > SURE * std;
+        let late = late.abs() - self.period > SURE * std;
         self.blocks.undeclared().chain(late.then_some("torque_delay"))
     }
 

@@ -10,8 +10,7 @@ use crate::gram::{
 use crate::laws::{Law, PARAMETERS};
 use crate::spring::Projection;
 use crate::unknowns::{
-    ACTIVE, CANDIDATES, CLIPS, DRY, ECCENTRIC, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, TORQUE_LATE,
-    ZERO,
+    ACTIVE, CANDIDATES, CLIPS, DRY, ECCENTRIC, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO,
 };
 
 pub(super) const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
@@ -336,12 +335,10 @@ impl Blocks {
         of(&groups.map(|group| if group & wrong == 0 { group } else { 0 }))
     }
 
-    /// Unknowns whose values no joint has: a torque that is read before it acts, an eccentricity that no mounting leaves.
+    /// Unknowns whose values no joint has: an eccentricity that no mounting leaves.
     pub(super) fn impossible(&self, found: &Posterior) -> Set {
         let size = found.x[ECCENTRIC].iter().map(|x| x * x).sum::<f64>().sqrt();
-        let (late, eccentric) = (found.x[TORQUE_LATE] < 0.0, size > self.priors.encoder_eccentricity);
-        let of = |wrong: bool, unknowns| if wrong { found.set & set(unknowns) } else { 0 };
-        of(late, TORQUE_LATE..SOFT) | of(eccentric, ECCENTRIC)
+        if size > self.priors.encoder_eccentricity { found.set & set(ECCENTRIC) } else { 0 }
     }
 
     /// Whether a zero that has moved can be told from another curve: one whose law is open only where deflections reach as

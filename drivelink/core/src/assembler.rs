@@ -266,9 +266,10 @@ impl Assembler {
             })
     }
 
-    /// Whether no frame of this cycle can be that of an earlier one.
+    /// Whether no frame of this cycle can be that of an earlier one, nor follows a late one: what held that up may have
+    /// held up this one's SYNC.
     fn certain(&self) -> bool {
-        !self.decoders.iter().any(|decoder| decoder.timed() && decoder.suspect > 0)
+        !self.decoders.iter().any(|decoder| decoder.replaced || decoder.timed() && decoder.suspect > 0)
     }
 
     fn pdo(&mut self, index: usize, data: &[u8]) -> Option<Sample> {
@@ -309,8 +310,7 @@ impl Assembler {
         }
         let any_timed = self.decoders.iter().any(TpdoDecoder::timed);
         // One that repeats itself in what is left of the cycle was no late one's successor.
-        let settled = self.certain() && !self.decoders.iter().any(|decoder| decoder.replaced);
-        (any_timed && self.usable() && settled).then(|| self.sample())
+        (any_timed && self.usable() && self.certain()).then(|| self.sample())
     }
 
     /// Whether a further frame in one cycle is the one that belongs to it.

@@ -63,7 +63,7 @@ fn a_joint_lacks_no_position_and_no_frame_has_two_senders() {
 }
 
 #[test]
-fn a_sample_after_a_missing_frame_may_be_a_period_late_until_the_late_one_has_come() {
+fn a_sample_after_a_missing_frame_may_be_a_period_late_and_so_may_that_of_the_cycle_in_which_it_came() {
     let mut made = assembler();
     made.feed(SYNC_COB_ID, &[], 1);
     made.feed(0x181, &drive(0, 0), 0);
@@ -74,5 +74,7 @@ fn a_sample_after_a_missing_frame_may_be_a_period_late_until_the_late_one_has_co
     made.feed(0x183, &1i32.to_le_bytes(), 0);
     made.feed(0x183, &2i32.to_le_bytes(), 0);
     assert!(made.feed(0x181, &drive(2, 0), 0).is_none()); // the second may be somebody else's, and come again
-    assert_eq!((made.feed(SYNC_COB_ID, &[], 1).unwrap().sequence, made.late_s), (2, 0.0));
+    assert_eq!((made.feed(SYNC_COB_ID, &[], 1).unwrap().sequence, made.late_s), (2, 1e-3));
+    made.feed(0x183, &3i32.to_le_bytes(), 0);
+    assert_eq!((made.feed(0x181, &drive(3, 0), 0).unwrap().sequence, made.late_s), (3, 0.0));
 }

@@ -11,7 +11,7 @@ import onlinekit as kit
 import pytest
 from scipy.signal import lfilter
 
-from estimator import Status
+from estimator import Effect, Status
 from sim.cases import case
 from sim.effects import make
 
@@ -218,7 +218,17 @@ def test_a_zero_far_from_the_declared_one_is_found(name, seed, off_rad):
     assert np.max(off[-8000:]) < 0.02
 
 
-def test_friction_at_rest_is_no_hysteresis():
+def test_a_change_is_found_beside_friction_that_nobody_declared():
+    """A third of the torque. In a fast motion the filtered sign of the velocity is small although the motor never rests."""
+    effects = [make("coulomb_friction", {"torque_nm": 0.01}, motor) for motor in range(2)]
+    moved = kit.motion("vsa-ii", 14.0, effects=effects, step=(10.0, 1.2))
+    estimates, _ = kit.play(kit.declared("vsa-ii"), moved.samples)
+    changed = np.flatnonzero(estimates.status & Status.CHANGED)
+    assert changed.size and 10000 <= changed[0] < 10500
+
+
+@pytest.mark.parametrize("declared_nm", [0.0, 0.15])
+def test_friction_at_rest_is_no_hysteresis(declared_nm):
     """Moves of a second between places, and a second's rest at each: there friction holds whatever the spring leaves."""
     plants = joints.Plants(
         *joints.polynomial(np.array([150.0, 8000.0])), 0.12, 0.8, 0.45, 0.3, 3.0, coulomb=np.array([0.15])
@@ -235,6 +245,9 @@ def test_friction_at_rest_is_no_hysteresis():
     noise = np.random.default_rng(5).normal(0.0, 0.02, (len(path), 1))
     record = joints.record(truth, 0, T, motor_counts=8192, link_bits=17, torque_noise=noise)
     joint = joints.joint_model(0.12, 0.8, model="polynomial", order=2, parameters={})
+    if declared_nm:
+        friction = Effect(name="coulomb_friction", parameters={"torque_nm": declared_nm})
+        joint = replace(joint, motors=(replace(joint.motors[0], effects=(friction,)),))
     estimates, estimator = kit.play(joint, record.samples())
     off = np.abs(estimates.stiffness_nm_rad / truth.sigma[:, 0, 0] - 1.0)
     assert estimator.undeclared()[0] == []

@@ -80,6 +80,7 @@ pub struct Balance {
     curve: Lanes<4, CURVE>,
     formed: Lanes<4, FORMED>,
     effects: Formed,
+    resting: Formed, // share in which dry friction may be anything
     waves: [f64; 2], // sin q and cos q
     stops: [f64; 3],
     last: f64, // φ that the stops have followed
@@ -101,6 +102,7 @@ impl Balance {
             curve: Lanes::rest([0.0; CURVE]),
             formed: Lanes::rest([0.0; FORMED]),
             effects: Formed::default(),
+            resting: Formed::default(),
             waves: [0.0; 2],
             stops: [0.0; 3],
             last: 0.0,
@@ -125,7 +127,7 @@ impl Balance {
         self.position = Channel::rest(theta);
         self.torque = Channel::rest(torque);
         self.formed = Lanes::rest([0.0; FORMED]);
-        self.effects = Formed::default();
+        (self.effects, self.resting) = (Formed::default(), Formed::default());
         self.rest_curve(phi);
     }
 
@@ -258,6 +260,7 @@ impl Balance {
         let [first, second] = [slopes[TERMS], slopes[TERMS + 1]];
         let speed = (SLOW * self.size.speed).max(f64::MIN_POSITIVE);
         let sign = (rate / speed).tanh();
+        self.resting.pass(filters, 1.0 - sign * sign);
         let step = (phi - self.last) / self.size.range.max(f64::MIN_POSITIVE);
         self.last = phi;
         for (stop, width) in self.stops.iter_mut().zip(STOP_WIDTHS) {
@@ -297,6 +300,12 @@ impl Balance {
             row[column] = *value;
         }
         row
+    }
+
+    /// The share of a row, 0 to 1, in which the motor stood: there dry friction is anything up to what it is in motion.
+    #[must_use]
+    pub fn resting(&self) -> f64 {
+        self.resting.main[0]
     }
 
     /// What the columns of memory and of a free curve are at a deflection: (torque, stiffness) by column.

@@ -12,6 +12,7 @@ use crate::balance;
 use crate::causes::{Noise, Odds};
 use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, TAILS, UNUSUAL};
 use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse};
+use crate::library::Element;
 use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection};
@@ -60,6 +61,7 @@ pub struct Readings {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Blocks {
     motor: Motor,
+    at_rest: f64, // dry friction that is declared, N·m
     priors: Priors,
     period: f64,
     rows: f64,
@@ -131,6 +133,7 @@ impl Blocks {
         let spring = Spring::new(motor);
         Blocks {
             motor: motor.clone(),
+            at_rest: motor.effects.iter().map(Element::at_rest).sum(),
             priors: *priors,
             period: period_s,
             rows,
@@ -262,9 +265,9 @@ impl Blocks {
         self.frame.is_some() && (self.ring.len() >= FEWEST || self.carried.is_some() || self.fitted)
     }
 
-    /// One row; what happened where it fills a block.
-    pub fn add(&mut self, row: &Row) -> Option<Closed> {
-        let weight = self.weight(row);
+    /// One row, and the share of it in which the motor stood; what happened where it fills a block.
+    pub fn add(&mut self, row: &Row, resting: f64) -> Option<Closed> {
+        let weight = self.weight(resting);
         let row = &row.map(|value| weight.sqrt() * value);
         if self.follow() {
             return Some(Closed::Reformed);
@@ -292,10 +295,9 @@ impl Blocks {
     }
 
     /// What a row tells beside others: dry friction at rest is anything up to what it is in motion.
-    fn weight(&self, row: &Row) -> f64 {
+    fn weight(&self, resting: f64) -> f64 {
         let Some(known) = self.posterior.as_ref().filter(|_| self.is_reference()) else { return 1.0 };
-        let rest = (1.0 - row[balance::DRY].powi(2)).max(0.0);
-        let open = rest * known.x[DRY].powi(2);
+        let open = (resting * (known.x[DRY] + self.at_rest)).powi(2);
         if open > 0.0 { self.noise.variance / (self.noise.variance + open) } else { 1.0 }
     }
 

@@ -12,6 +12,7 @@ mod table;
 
 use serde::{Deserialize, Serialize};
 
+use crate::choices::SURE;
 use crate::error::Error;
 
 use table::one;
@@ -298,6 +299,15 @@ impl Element {
         let terms = self.terms(c);
         let weighted = self.values[0] * terms[0];
         if self.kind.terms() == 2 { weighted + self.values[1] * terms[1] } else { weighted }
+    }
+
+    /// Dry friction of a motor, N·m, that may hold it at rest by anything up to this; 0 of what has none.
+    #[must_use]
+    pub fn at_rest(&self) -> f64 {
+        let Some(place) = table::smoothing(self.kind) else { return 0.0 };
+        let sliding = SURE * self.values[place]; // its sign has changed
+        let at = |velocity| self.torque(&Coordinates { velocity, ..Coordinates::default() }).abs();
+        at(sliding).max(at(-sliding))
     }
 
     /// (x, ∂x/∂φ) where x depends on the deflection alone, so that the element is a part of the spring.

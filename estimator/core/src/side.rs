@@ -315,7 +315,7 @@ impl Side {
             resolution: (12.0 * positions).sqrt(),
         };
         let row = self.balance.row();
-        let closed = self.blocks.add(&row)?;
+        let closed = self.blocks.add(&row, self.balance.resting())?;
         let doubted = self.doubtful;
         self.judge();
         match closed {

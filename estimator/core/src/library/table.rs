@@ -30,6 +30,11 @@ pub(super) const MEMORY: &[Parameter] = &[
     shape("shape", "share of the law that depends on the direction (Dahl 1, Bouc-Wen 0.5)", Some(1.0)),
 ];
 
+/// Where the velocity over which the sign changes stands among a kind's parameters.
+pub(super) fn smoothing(kind: &Kind) -> Option<usize> {
+    kind.parameters.iter().position(|parameter| parameter.name == SMOOTHING.name)
+}
+
 pub(super) fn one(term: f64) -> [f64; 2] {
     [term, 0.0]
 }

@@ -335,10 +335,13 @@ impl Blocks {
         of(&groups.map(|group| if group & wrong == 0 { group } else { 0 }))
     }
 
-    /// Unknowns whose values no joint has: an eccentricity that no mounting leaves.
+    /// Unknowns whose values no joint has: a transmission's damping that drives beside a motor's that is declared, an
+    /// eccentricity that no mounting leaves.
     pub(super) fn impossible(&self, found: &Posterior) -> Set {
         let size = found.x[ECCENTRIC].iter().map(|x| x * x).sum::<f64>().sqrt();
-        if size > self.priors.encoder_eccentricity { found.set & set(ECCENTRIC) } else { 0 }
+        let drives = self.motor.damping > 0.0 && found.x[RATE] < 0.0;
+        let of = |wrong: bool, unknowns| if wrong { found.set & set(unknowns) } else { 0 };
+        of(drives, RATE..RATE + 1) | of(size > self.priors.encoder_eccentricity, ECCENTRIC)
     }
 
     /// Whether a zero that has moved can be told from another curve: one whose law is open only where deflections reach as

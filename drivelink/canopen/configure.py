@@ -119,7 +119,7 @@ class Configurator:
             result = session.result
         except DriveError as error:
             result = error
-        except Exception as error:
+        except Exception as error:  # of one node: the others are configured
             logger.debug("the configuration of node %d has failed", node, exc_info=error)
             result = DriveError(f"node {node}: {type(error).__name__} in its configuration: {error}")
         del self._sessions[node]

@@ -304,7 +304,7 @@ def _check_workers(client: Client, address: str) -> None:
     """Check that all present workers have this version; later ones are checked per task."""
     try:
         versions = client.run(_worker_version)
-    except Exception as error:
+    except Exception as error:  # whatever a worker of another version raises
         line = " ".join(str(error).split())
         raise FleetError(
             f"--scheduler {address}: its workers need drivelink {__version__}: {line}"

@@ -127,7 +127,7 @@ def _checked(what: str) -> Iterator[None]:
         yield
     except FleetError:
         raise
-    except Exception as error:
+    except Exception as error:  # each storage of fsspec has its own
         raise FleetError(f"{what}: {_line(error)}") from error
 
 

@@ -213,11 +213,8 @@ class JointView:
         known = math.isfinite(last.true_stiffness_nm_rad)
         spark = width - (78 if known else 69)
         table = Table.grid(padding=(0, 2, 0, 0))
-        for least in (
-            10,
-            25,
-            26,
-        ):  # where it is narrower, an ellipsis ends a number: half of one is another one
+        # Where it is narrower, an ellipsis ends a number: half of one is another one.
+        for least in (10, 25, 26):
             table.add_column(no_wrap=True, min_width=least if width >= 70 else None)
         if spark >= 4:
             table.add_column(no_wrap=True, ratio=1)

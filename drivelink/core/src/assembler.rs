@@ -266,8 +266,8 @@ impl Assembler {
             })
     }
 
-    /// Whether no frame of this cycle can be that of an earlier one, nor follows a late one: what held that up may have
-    /// held up this one's SYNC.
+    /// Whether no frame of this cycle can be that of an earlier one, or an answer to a SYNC that came late: where a frame
+    /// has come late, the one after it may be such an answer.
     fn certain(&self) -> bool {
         !self.decoders.iter().any(|decoder| decoder.replaced || decoder.timed() && decoder.suspect > 0)
     }

@@ -12,7 +12,6 @@ mod table;
 
 use serde::{Deserialize, Serialize};
 
-use crate::choices::SURE;
 use crate::error::Error;
 
 use table::one;
@@ -305,7 +304,7 @@ impl Element {
     #[must_use]
     pub fn at_rest(&self) -> f64 {
         let Some(place) = table::smoothing(self.kind) else { return 0.0 };
-        let sliding = SURE * self.values[place]; // its sign has changed
+        let sliding = 3.0 * self.values[place]; // tanh 3 is 0.995: its sign has changed
         let at = |velocity| self.torque(&Coordinates { velocity, ..Coordinates::default() }).abs();
         at(sliding).max(at(-sliding))
     }

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import scene
+from scene import joints
 
 from drivelink.demo.simulate import world_from_joint
 from drivelink.jointfile import JointFile, parse
@@ -120,14 +121,7 @@ def joint_of(names: Sequence[str], seed: int) -> tuple[JointFile, JointFile]:
 def measured(joint: JointFile, seconds: float, effects: Sequence[str] = ()) -> Record:
     """A recording of the joint's world, with further effects."""
     columns = record(world_from_joint(joint, effects=effects), seconds)
-    names = [f"motor{i + 1}" for i in range(len(joint.motor))]
-    return Record(
-        period_s=joint.bus.period_s,
-        sequence=np.arange(len(columns["time_s"])),
-        motor_position_rad=np.stack([columns[f"{name}_position_rad"] for name in names], axis=1),
-        motor_torque_nm=np.stack([columns[f"{name}_torque_nm"] for name in names], axis=1),
-        link_position_rad=columns["link_position_rad"],
-    )
+    return joints.of_world(columns, period_s=joint.bus.period_s)
 
 
 LIKELY, CERTAIN = 0.1, 0.9

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scene
-from scene import ROOT
+from scene import ROOT, joints
 from scipy.signal import butter, sosfiltfilt
 
 from drivelink import jointfile, recording
@@ -166,13 +166,8 @@ def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> 
 def shaft_record(folder: Path, number: str) -> Record:
     """Both encoders and the motor's torque, which has a clock of its own, on one grid of a millisecond."""
     rows, motor, time = _shaft_rows(folder, number)
-    return Record(
-        period_s=1e-3,
-        sequence=np.arange(len(time)),
-        motor_position_rad=np.radians(np.interp(time, rows[:, 0], rows[:, 1]))[:, None],
-        motor_torque_nm=np.interp(time, motor[:, 0], motor[:, 2])[:, None],
-        link_position_rad=np.radians(np.interp(time, rows[:, 0], rows[:, 2])),
-    )
+    theta, q = (np.radians(np.interp(time, rows[:, 0], rows[:, column])) for column in (1, 2))
+    return joints.recorded(theta, np.interp(time, motor[:, 0], motor[:, 2]), q)
 
 
 def diagnosed(run: Run, data: Path, out: Path | None) -> dict[str, Any]:

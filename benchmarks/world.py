@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scene import joints
 
 from estimator import Record
 
@@ -45,11 +46,5 @@ def simulate(played: str | None = None, **settings: float | str) -> World:
     names, *lines = done.stdout.splitlines()
     table = np.array([line.split(",") for line in lines], dtype=float).T
     column = dict(zip(names.split(","), table, strict=True))
-    record = Record(
-        period_s=float(settings.get("period", T)),
-        sequence=np.arange(len(lines)),
-        motor_position_rad=column["motor1_position_rad"][:, None],
-        motor_torque_nm=column["motor1_torque_nm"][:, None],
-        link_position_rad=column["link_position_rad"],
-    )
+    record = joints.of_world(column, period_s=float(settings.get("period", T)))
     return World(record, column["true_stiffness_nm_rad"], column)

@@ -115,13 +115,8 @@ class World:
         if gauge := effects.get("gauge_late_s", 0.0) / PERIOD_S:
             q = theta + np.interp(index - gauge, index, q - theta)
         q = np.interp(index - late, index, q) + effects.get("zero_rad", 0.0)
-        return Record(
-            period_s=PERIOD_S,
-            sequence=index,
-            motor_position_rad=(np.floor(theta / MOTOR_LSB) * MOTOR_LSB)[:, None],
-            motor_torque_nm=(torque + TORQUE_NOISE * rng.standard_normal(len(torque)))[:, None],
-            link_position_rad=np.floor(q / LINK_LSB) * LINK_LSB,
-        )
+        torque = torque + TORQUE_NOISE * rng.standard_normal(len(torque))
+        return joints.recorded(joints.quantise(theta, MOTOR_LSB), torque, joints.quantise(q, LINK_LSB))
 
 
 def model(error: float = 0.0, *, linked: bool = True) -> JointModel:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
+import joints
 import numpy as np
 
 from estimator import JointModel, Motor, Record, Transmission
@@ -80,7 +81,8 @@ def draw(kind: str, seed: int, *, effects: bool = True, seconds: float = 8.0, he
         for i in range(motors)
     )
     model = JointModel(arrangement=plant.arrangement, motors=declared, period_s=PERIOD_S)
-    return Drawn(_recorded(record(world, seconds), motors, kind), model, (gear,) * motors)
+    recorded = joints.of_world(record(world, seconds), linked=kind != "none")
+    return Drawn(recorded, model, (gear,) * motors)
 
 
 def _between(rng: np.random.Generator, low: float, high: float) -> float:
@@ -155,17 +157,6 @@ def _effects(
     }
     chosen = rng.choice(sorted(offered), size=int(rng.integers(0, 3)), replace=False)
     return (*found, *(make(str(name), offered[str(name)]) for name in chosen))
-
-
-def _recorded(rows: dict[str, np.ndarray], motors: int, kind: str) -> Record:
-    names = [f"motor{i + 1}" for i in range(motors)]
-    return Record(
-        period_s=PERIOD_S,
-        sequence=np.arange(len(rows["time_s"])),
-        motor_position_rad=np.stack([rows[f"{name}_position_rad"] for name in names], axis=1),
-        motor_torque_nm=np.stack([rows[f"{name}_torque_nm"] for name in names], axis=1),
-        link_position_rad=None if kind == "none" else rows["link_position_rad"],
-    )
 
 
 def faulty(record: Record, factors: Mapping[str, float]) -> Record:

@@ -6,7 +6,7 @@ arrays carry the joint as their first axis, so a hundred random joints cost what
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -235,14 +235,31 @@ def record(
         velocity = truth.omega[:, joint]
         velocity = np.round(velocity / velocity_rad_s) * velocity_rad_s if velocity_rad_s else velocity
     tau = truth.tau[:, joint]
+    return replace(
+        recorded(theta, tau if torque_noise is None else tau + torque_noise, q, period_s),
+        motor_velocity_rad_s=velocity,
+    )
+
+
+def recorded(theta: Array, tau: Array, q: Array | None = None, period_s: float = 1e-3) -> Record:
+    """A recording without gaps of a joint's channels; of one motor (n,), of several (n, m)."""
     return Record(
         period_s=period_s,
-        sequence=np.arange(len(q)),
-        motor_position_rad=np.ascontiguousarray(theta),
-        motor_velocity_rad_s=velocity,
-        motor_torque_nm=tau if torque_noise is None else tau + torque_noise,
+        sequence=np.arange(len(theta)),
+        motor_position_rad=np.ascontiguousarray(theta).reshape(len(theta), -1),
+        motor_torque_nm=np.reshape(tau, (len(theta), -1)),
         link_position_rad=q,
     )
+
+
+def of_world(rows: Mapping[str, Array], *, linked: bool = True, period_s: float = 1e-3) -> Record:
+    """What `sim.world.record` gives, as a recording; without the link's encoder if need be."""
+    motors = [name for name in ("motor1", "motor2") if f"{name}_position_rad" in rows]
+    theta, tau = (
+        np.stack([rows[f"{name}_{what}"] for name in motors], axis=1)
+        for what in ("position_rad", "torque_nm")
+    )
+    return recorded(theta, tau, rows["link_position_rad"] if linked else None, period_s)
 
 
 def part(whole: Record, rows: slice | Array) -> Record:

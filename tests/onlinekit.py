@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
+import joints
 import numpy as np
 
 from drivelink._core import Assembler, JointPipeline
@@ -149,13 +150,13 @@ def _moved(rows: Mapping[str, np.ndarray]) -> Motion:
 
 def recorded(samples: Sequence[Sample], sign: float = 1.0) -> Record:
     """The samples as a recording; torque and link position may have the other sign."""
-    return Record(
-        period_s=PERIOD_S,
-        sequence=np.arange(len(samples)),
-        motor_position_rad=np.array([s.motor_position_rad for s in samples]),
-        motor_torque_nm=sign * np.array([s.motor_torque_nm for s in samples]),
-        link_position_rad=sign * np.array([s.link_position_rad for s in samples]),
+    theta, tau, q = (
+        np.array(column)
+        for column in zip(
+            *((s.motor_position_rad, s.motor_torque_nm, s.link_position_rad) for s in samples), strict=True
+        )
     )
+    return joints.recorded(theta, sign * tau, sign * q)
 
 
 def _stiffer(plant: JointPlant, factor: float) -> JointPlant:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import diagnosiskit as kit
+import joints
 import numpy as np
 import pytest
 
@@ -16,13 +17,9 @@ EVERY = 5  # samples of a millisecond in one period of the slow recording
 def slow(record: Record) -> Record:
     """The same motion with a longer period: the torque is that of its hold."""
     assert record.link_position_rad is not None
-    return Record(
-        period_s=EVERY * record.period_s,
-        sequence=np.arange(len(record) // EVERY),
-        motor_position_rad=record.motor_position_rad[::EVERY],
-        motor_torque_nm=record.motor_torque_nm.reshape(-1, EVERY).mean(axis=1)[:, None],
-        link_position_rad=record.link_position_rad[::EVERY],
-    )
+    torque = record.motor_torque_nm.reshape(-1, EVERY).mean(axis=1)
+    theta, q = record.motor_position_rad[::EVERY], record.link_position_rad[::EVERY]
+    return joints.recorded(theta, torque, q, EVERY * record.period_s)
 
 
 def test_fit_writes_a_delay_of_two_samples_and_none_of_tens_of_milliseconds():

@@ -297,13 +297,8 @@ def test_friction_is_named_where_the_declared_spring_carries_nothing():
     torque = motor.inertia_kg_m2 * acceleration + motor.viscous_damping_nm_s_rad * velocity
     torque += 0.4 * np.tanh(velocity / 0.05) + 0.5 * apart
     rng = np.random.default_rng(7)
-    record = Record(
-        period_s=1e-3,
-        sequence=np.arange(len(time)),
-        motor_position_rad=theta[:, None] + 1e-5 * rng.standard_normal((len(time), 1)),
-        motor_torque_nm=torque[:, None] + 0.01 * rng.standard_normal((len(time), 1)),
-        link_position_rad=theta + apart,
-    )
+    theta_read, torque = (x + e * rng.standard_normal(len(time)) for x, e in ((theta, 1e-5), (torque, 0.01)))
+    record = joints.recorded(theta_read, torque, theta + apart)
     found = diagnose(record, kit.model(linked=False))
     (first,) = found.effects
     assert first.name == "coulomb_friction"
@@ -315,13 +310,5 @@ def test_friction_is_named_where_the_declared_spring_carries_nothing():
 def test_rounding_of_a_healthy_joint_as_it_is_packaged_is_no_effect():
     """In its link's balance 3 % of the torque is rounding: less where all inertias and torques shrink alike."""
     joint = jointfile.load(Path(drivelink.__file__).parent / "joints" / "constant.toml")
-    columns = simulated(world_from_joint(joint), 40.0)
-    record = Record(
-        period_s=joint.bus.period_s,
-        sequence=np.arange(len(columns["time_s"])),
-        motor_position_rad=columns["motor1_position_rad"][:, None],
-        motor_torque_nm=columns["motor1_torque_nm"][:, None],
-        link_position_rad=columns["link_position_rad"],
-    )
-    found = diagnose(record, joint.model())
+    found = diagnose(joints.of_world(simulated(world_from_joint(joint), 40.0)), joint.model())
     assert (found.verdict, found.effects) == ("sufficient", ())

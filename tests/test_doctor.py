@@ -5,6 +5,7 @@ from pathlib import Path
 
 import can
 import daemonkit
+import joints
 import numpy as np
 import pytest
 from canopenkit import Item, Slave, Wire, drive_objects, eds_text
@@ -26,7 +27,6 @@ from drivelink.doctor.motion import judge_record
 from drivelink.doctor.nodes import _describe_node
 from drivelink.jointfile import parse
 from drivelink.notice import Severity
-from estimator.sample import Record
 
 REPOSITORY = Path(__file__).parents[1]
 CHANNELS = itertools.count()
@@ -160,11 +160,7 @@ def test_too_short_a_look_and_a_joint_at_rest_are_no_judgement():
     assert "the joint moves: look longer" in finding.fix  # it is not told to move what moves
     section = Section("Units and signs")
     for sequence in (np.arange(9000), np.arange(9000) * 2):
-        still = np.zeros((9000, 1))
-        record = Record(
-            period_s=1e-3, sequence=sequence, motor_position_rad=still, motor_torque_nm=still,
-            link_position_rad=still[:, 0],
-        )  # fmt: skip
+        record = replace(joints.recorded(*np.zeros((3, 9000))), sequence=sequence)
         judge_record(section, parse(joint_on("still")), record)
     at_rest, busy = section.notices
     assert "move the joint during the check" in at_rest.fix

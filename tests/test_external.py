@@ -18,7 +18,6 @@ from estimator import (
     JointModel,
     LinkDynamics,
     Motor,
-    Record,
     Sample,
     Status,
     Transmission,
@@ -257,14 +256,7 @@ def test_fit_finds_the_link_with_its_payload_in_a_free_motion():
     payload = (1.0 * 0.3**2, 1.0 * 0.3 * 9.81)
     rows = record(world(seed=7, payload=payload), 14.0)
     declared = LinkDynamics(inertia_kg_m2=0.4, viscous_damping_nm_s_rad=0.1, gravity_nm=GRAVITY_NM)
-    free = Record(
-        period_s=T,
-        sequence=np.arange(len(rows["time_s"])),
-        motor_position_rad=rows["motor1_position_rad"][:, None],
-        motor_torque_nm=rows["motor1_torque_nm"][:, None],
-        link_position_rad=rows["link_position_rad"],
-    )
-    found = identify(free, model(declared))
+    found = identify(joints.of_world(rows), model(declared))
     link = found.model.link
     truth = {"inertia_kg_m2": 0.4 + payload[0], "gravity_nm": GRAVITY_NM + payload[1]}
     for name, value in truth.items():

@@ -32,7 +32,6 @@ from estimator.diagnosis.search import Search
 from estimator.diagnosis.verdict import Judge, _Judged
 from estimator.identify import identify
 from estimator.model import JointModel, Motor, Transmission
-from estimator.sample import Record
 
 
 def finding(name: str, probability: float, **more: Any) -> Finding:
@@ -230,13 +229,7 @@ def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
 def test_a_one_way_motion_has_no_free_curve_over_time(speed):
     time = np.arange(8000) * kit.PERIOD_S
     motion = speed * time + 0.2 * np.sin(2.0 * time) + 0.05 * np.sin(9.0 * time)
-    record = Record(
-        period_s=kit.PERIOD_S,
-        sequence=np.arange(len(time)),
-        motor_position_rad=motion[:, None],
-        motor_torque_nm=np.cos(3.0 * time)[:, None],
-        link_position_rad=motion + 0.01 * np.cos(3.0 * time),
-    )
+    record = joints.recorded(motion, np.cos(3.0 * time), motion + 0.01 * np.cos(3.0 * time))
     problem = Problem([record], kit.model(), 15.0)
     bases = _bases(problem.frames[0], problem.null(), "motor", 0)
     over_time = [names for names, _ in bases if names == ("velocity", "time")]

@@ -13,7 +13,7 @@ from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.output import plots
 from drivelink.output.fitreport import fit_plot
-from estimator import EstimatorError, JointModel, LinkDynamics, Motor, Record, Status, Transmission, fit
+from estimator import EstimatorError, JointModel, LinkDynamics, Motor, Status, Transmission, fit
 from estimator.transmissions import MODELS
 
 T = 1e-3
@@ -110,11 +110,7 @@ def test_an_exponential_spring_is_found_from_nothing_in_batch_and_on_line(b):
 def test_what_cannot_be_fitted_is_reported(elbow):
     plants, _, truth = elbow
     model = joints.joint_model(plants.B[0, 0], plants.D[0, 0])
-    record, zeros = _record(truth, 0), np.zeros((3000, 1))
-    still = Record(
-        period_s=T, sequence=np.arange(3000), motor_position_rad=zeros, motor_torque_nm=zeros,
-        link_position_rad=zeros[:, 0],
-    )  # fmt: skip
+    record, still = _record(truth, 0), joints.recorded(*np.zeros((3, 3000)))
     short = "too short for a bandwidth of 4 Hz: expected at least 60"
     for wrong, how, message in (
         (still, (model,), "stands still"),
@@ -180,13 +176,7 @@ def test_of_a_joint_that_a_hand_guides_no_stiffness_is_stated():
 def test_the_spring_of_a_serial_joint_bears_on_the_motor_that_sets_its_lever():
     """Nobody declares the lever: undeclared, all that its motor bears would be unexplained."""
     rows = simjoints.measured(simjoints.sea(motors=2, lever=0.1), seconds=8.0)
-    motors = [
-        np.stack([rows[f"motor{i}_{x}"] for i in (1, 2)], axis=1) for x in ("position_rad", "torque_nm")
-    ]
-    record = Record(
-        period_s=T, sequence=np.arange(8000), motor_position_rad=motors[0], motor_torque_nm=motors[1],
-        link_position_rad=rows["link_position_rad"],
-    )  # fmt: skip
+    record = joints.of_world(rows)
     declared = tuple(
         Motor(inertia_kg_m2=0.125, viscous_damping_nm_s_rad=0.8, transmission=Transmission(model=model))
         for model in ("linear", "none")

@@ -136,13 +136,8 @@ def _arm(seed: int, seconds: float = 16.0) -> Record:
             load += (DAMPING + ARM.viscous_damping_nm_s_rad) * omega + OFFSET
             omega += T / substeps * (torque - load) / (ROTOR + ARM.inertia_kg_m2)
             theta += T / substeps * omega
-    lsb = 2.0 * np.pi / 65536
-    return Record(
-        period_s=T,
-        sequence=np.arange(n),
-        motor_position_rad=(np.floor(rows[:, 0] / lsb) * lsb)[:, None],
-        motor_torque_nm=(rows[:, 1] + 0.02 * rng.standard_normal(n))[:, None],
-    )
+    theta_read = joints.quantise(rows[:, 0], 2.0 * np.pi / 65536)
+    return joints.recorded(theta_read, rows[:, 1] + 0.02 * rng.standard_normal(n))
 
 
 @pytest.fixture(scope="module")

@@ -224,15 +224,8 @@ def test_fit_reports_what_the_motion_does_not_decide(tmp_path, capsys):
 
 def test_a_link_whose_balance_leaves_no_inertia_is_kept_as_declared_with_a_word_of_why():
     vsa = case("vsa-ii")
-    columns = record(vsa.world(excitation=vsa.rich, seed=1), 5.0)
-    motors = [
-        np.column_stack([columns[f"motor{k}_{what}"] for k in (1, 2)])
-        for what in ("position_rad", "torque_nm")
-    ]
-    run = Record(
-        period_s=1e-3, sequence=np.arange(len(motors[0])), motor_position_rad=motors[0], motor_torque_nm=motors[1],
-        link_position_rad=np.degrees(columns["link_position_rad"]),
-    )  # fmt: skip
+    run = joints.of_world(record(vsa.world(excitation=vsa.rich, seed=1), 5.0))
+    run = gatekit.faulty(run, {"link_position": DEGREE})
     model = jointfile.load(ROOT / "examples" / "vsa-ii.toml").model()
     found = identify(run, model)
     assert found.model.link == model.link and any(
@@ -305,13 +298,8 @@ def test_a_jerk_before_a_slow_motion_does_not_make_its_encoder_noise_an_inertia(
     torque = B * rate(rate(motor)) + 0.7 * rate(motor) - K * (link - motor)
     rows = slice(20, -20, round(period / fine))
     count = 2.0 * math.pi / 2**16
-    record = Record(
-        period_s=period,
-        sequence=np.arange(len(time[rows])),
-        motor_position_rad=np.floor(motor[rows] / count)[:, None] * count,
-        motor_torque_nm=torque[rows][:, None],
-        link_position_rad=np.floor(link[rows] / (0.5 * count)) * 0.5 * count,
-    )
+    read = joints.quantise(motor[rows], count), torque[rows], joints.quantise(link[rows], 0.5 * count)
+    record = joints.recorded(*read, period)
     spring = Motor(inertia_kg_m2=B, transmission=Transmission(model="linear"))
     assert examine(record, JointModel(arrangement="single", motors=(spring,), period_s=period)) == []
 

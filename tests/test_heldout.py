@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import diagnosiskit as kit
+import joints
 import numpy as np
 import pytest
 
@@ -47,13 +48,7 @@ def record(stiffness: float, amplitude: float = 1.0, strange_nm: float = STRANGE
     theta, phi, own = motion(amplitude)
     strange = strange_nm * np.sin(2.0 * np.pi * STRANGE_HZ * (np.arange(len(theta)) + 0.5) * T)
     torque = own - stiffness * np.interp(np.arange(len(phi)) + 0.5, np.arange(len(phi)), phi) + strange
-    return Record(
-        period_s=T,
-        sequence=np.arange(len(theta)),
-        motor_position_rad=theta[:, None],
-        motor_torque_nm=torque[:, None],
-        link_position_rad=theta + phi,
-    )
+    return joints.recorded(theta, torque, theta + phi)
 
 
 def mean_squares(amplitude: float = 1.0) -> tuple[float, float]:

@@ -21,7 +21,6 @@ from drivelink.output.document import Grid, Section, show
 from drivelink.output.numbers import Units
 from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
 from drivelink.output.progress import Meter
-from estimator.sample import Record
 
 JOINT = fleetkit.JOINT.format(name="elbow")
 
@@ -107,9 +106,7 @@ def test_what_cannot_be_diagnosed_is_one_line(folder, capsys):
 
 
 def test_a_baseline_that_cannot_be_measured_is_a_warning(caplog):
-    k, still = np.arange(50), np.zeros((50, 1))
-    columns = {"motor_position_rad": still, "motor_torque_nm": still, "link_position_rad": 1e-3 * k}
-    record = Record(period_s=1e-3, sequence=k, **columns)
+    record = joints.recorded(np.zeros(50), np.zeros(50), 1e-3 * np.arange(50))
     model = joints.joint_model(0.1, 0.0, model="linear", order=None, parameters={"k_nm_rad": 100.0})
     assert floor_entry(record, model, 1.0) == {}
     assert "the daemon cannot raise the model alarm: " in caplog.text

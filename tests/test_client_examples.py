@@ -7,7 +7,7 @@ import runpy
 import shutil
 import signal
 import subprocess
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -47,17 +47,22 @@ def test_the_python_examples_run(daemon, name, expected, more):
         assert any(re.search(expected, line) for line in process.stdout)
 
 
-@pytest.mark.parametrize("name", ["subscribe_latest.py", "subscribe_wait.py", "subscribe_async.py"])
-@pytest.mark.parametrize("ending", ["Ctrl-C", "closed pipe"])
-def test_a_python_example_ends_without_a_traceback(daemon, name, ending):
-    with python(EXAMPLES / name, "elbow", daemon, "30") as process:
-        process.stdout.readline()
-        if ending == "Ctrl-C":
-            process.send_signal(signal.SIGINT)
-        else:
-            process.stdout.close()
-            process.stdout = None
-        assert "Traceback" not in process.communicate(timeout=20)[1]
+def test_python_examples_end_without_a_traceback_by_ctrl_c_and_where_nobody_reads_on(daemon):
+    with ExitStack() as stack:  # at once: each prints a line now and then
+        running = [
+            (stack.enter_context(python(EXAMPLES / f"subscribe_{name}.py", "elbow", daemon, "30")), pipe)
+            for name in ("latest", "wait", "async")
+            for pipe in (False, True)
+        ]
+        for process, pipe in running:
+            process.stdout.readline()
+            if pipe:
+                process.stdout.close()
+                process.stdout = None
+            else:
+                process.send_signal(signal.SIGINT)
+        for process, _ in running:
+            assert "Traceback" not in process.communicate(timeout=20)[1]
 
 
 def test_a_controller_in_its_safe_state_says_why(monkeypatch, capsys):

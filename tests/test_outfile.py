@@ -8,7 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import joints
 import numpy as np
 import pytest
 import zenohkit
@@ -159,20 +158,12 @@ def test_a_recording_takes_the_place_of_another_one_with_its_first_block(folder)
 # The commands
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    rng = np.random.default_rng(5)
-    plants = joints.Plants(*joints.polynomial(np.array([[[100.0]]])), 0.5, 0.8, 0.4, 0.2, 5.0)
-    truth = joints.simulate(plants, joints.sweep(rng, 4000, 1, 1, 0.001, 8.0, 3.0), 0.001)
-    record = joints.record(truth, 0, 0.001)
-    return joints.write_csv(record, tmp_path_factory.mktemp("data") / "r.csv").read_bytes()
-
-
 @pytest.fixture
-def files(folder, data):
+def files(folder, fleet):
     recording, joint = folder / "r.csv", folder / "elbow.toml"
-    recording.write_bytes(data)
-    joint.write_text(JOINT + "# my own remark\n")
+    recording.write_bytes((fleet / "recordings" / "elbow-2026-01-05.csv").read_bytes())
+    text = (fleet / "joints" / "elbow.toml").read_text()
+    joint.write_text(text.partition("[link.dynamics]")[0] + "# my own remark\n")
     return recording, joint
 
 
@@ -236,12 +227,3 @@ def test_fit_brings_its_own_joint_file_up_to_date_in_one_step(files, monkeypatch
         assert cli.main([*arguments, "--force", "--out", str(out), *more]) == 0
         assert "# my own remark" in joint.read_text()
     assert sorted(path.name for path in out.iterdir()) == ["fit.json", "fit.png"]
-
-
-def test_a_result_is_printed_before_a_file_is_written_that_cannot_be(files, capsys):
-    recording, joint = files
-    (recording.parent / "taken").write_text("a file")
-    out = recording.parent / "taken" / "out"
-    assert cli.main(["fit", str(recording), "--joint", str(joint), "--out", str(out)]) != 0
-    said = capsys.readouterr()
-    assert "torque balance" in said.out and "taken" in said.err and said.err.count("\n") == 1

@@ -81,22 +81,20 @@ def many_frames(n=3000):
     ]
 
 
-def recorded(path, frames, every, ended=True):
-    sink = open_sink(path, JOINT)
-    for k, frame in enumerate(frames, 1):
-        sink.frame(frame.stamp_ns, frame.can_id, frame.data)
-        if k % every == 0:
-            sink.flush()
-    (sink.close if ended else sink.abandon)()
-    return path
-
-
 @pytest.mark.parametrize(
     ("suffix", "ended"), [(s, e) for s, kind in CAN_FORMATS.items() if kind.writer for e in (True, False)]
 )
 def test_what_is_recorded_is_read_back_also_without_its_end(suffix, ended, tmp_path):
-    frames = many_frames()
-    back = list(read_frames(recorded(tmp_path / f"x{suffix}", frames, 1000, ended)))
+    frames, path = many_frames(), tmp_path / f"x{suffix}"
+    sink = open_sink(path, JOINT)
+    for k, frame in enumerate(frames, 1):
+        sink.frame(frame.stamp_ns, frame.can_id, frame.data)
+        if k % 1000 == 0:
+            sink.flush()
+    if ended:
+        sink.close()
+    back = list(read_frames(path))  # as a kill leaves it
+    sink.abandon()
     assert [(f.can_id, f.data) for f in back] == [(f.can_id, f.data) for f in frames]
     first = back[0].stamp_ns - frames[0].stamp_ns  # ASC counts from its start, in microseconds
     assert all(abs(b.stamp_ns - f.stamp_ns - first) < 2000 for b, f in zip(back, frames, strict=True))

@@ -84,6 +84,24 @@ def test_a_narrow_view_ends_a_number_with_an_ellipsis_and_has_no_sparkline_of_on
             assert width < 80 or "…" not in text
 
 
+def test_a_small_view_has_its_names_whole_and_says_whether_it_is_valid():
+    for width, height in ((60, 16), (60, 10), (44, 9)):
+        shown = "\n".join(lines(filled(), width, height))
+        assert "deflection" in shown and "N·m/rad" in shown and "● valid" in shown, (width, height, shown)
+
+
+def test_what_to_look_at_is_not_cut_at_the_first_line():
+    said = "drivelink-vsa-ii: the bus is lost: Failed to receive: [Errno 104] Connection reset by peer"
+    shown = [line.plain for line in status_lines(STATUS | {"conditions": [said]}, 76)]
+    assert shown[-2].startswith("look here  drivelink-vsa-ii") and "Errno" in shown[-2]
+    assert shown[-1].endswith("  Connection reset by peer")
+    assert all(len(line) <= 76 for line in shown)
+
+
+def test_the_load_of_a_lost_bus_is_not_shown():
+    assert shape(STATUS).load == "38 %" and shape(STATUS | {"state": "bus lost"}).load == ""
+
+
 def test_the_view_says_what_matters_at_80_by_24():
     text = "\n".join(lines(filled(truth=True)))
     for part in ("elbow", "running", "stiffness", "±", "N·m/rad", "truth", "rms error 0.20 %", "torque", "deflection",
@@ -388,6 +406,7 @@ def test_a_live_view_needs_a_terminal_with_its_characters():
         file = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
         assert can_draw(Console(file=file, force_terminal=True)) is able
         assert not can_draw(Console(file=file, force_terminal=False))
+        assert not can_draw(Console(file=file, force_terminal=True, _environ={"TERM": "dumb"}))
 
 
 @pytest.mark.parametrize(

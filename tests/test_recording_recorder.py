@@ -4,6 +4,8 @@ import json
 import signal
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
 import daemonkit
 import zenohkit
@@ -17,7 +19,7 @@ from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
-from drivelink.recording.recorder import BusTap, Recorder
+from drivelink.recording.recorder import BusTap, Recorder, ZenohTap
 
 
 def joint_file(folder, endpoint):
@@ -124,6 +126,23 @@ def test_a_bus_is_recorded_by_listening_only(tmp_path):
         found = [tuple(row) for row in read(tmp_path / name, joint).motor_position_rad.tolist()]
         # The last sample is recorded when its cycle has ended.
         assert len(found) >= least and found == samples[len(samples) - len(found) :][: len(found)], name
+
+
+def test_estimates_that_were_lost_on_the_way_are_said(tmp_path, monkeypatch):
+    monkeypatch.setattr("drivelink.recording.recorder.follow_document", MagicMock())
+    joint = jointfile.load(Path(jointfile.__file__).parents[1] / "joints" / "vsa-ii.toml")
+    session: Any = MagicMock()
+    with Recorder(sink := open_sink(tmp_path / "a.mcap", joint, ""), []) as recorder:
+        recorder.taps.append(tap := ZenohTap(session, joint, sink))
+        for kind, numbers in (("sample", (5, 6, 7, 8, 9)), ("estimate", (5, 8, 9, 3, 4))):  # and began again
+            for number in numbers:
+                tap._count(kind, number)
+        summary = _Summary(tmp_path / "a.mcap", recorder)
+        assert summary.text().endswith("s, 2 cycles without estimate")
+        assert {k: n for k, n in summary.document().items() if k.startswith("cycles_without")} == {
+            "cycles_without_sample": 0,
+            "cycles_without_estimate": 2,
+        }
 
 
 def test_the_line_that_was_rewritten_is_erased_before_the_result(tmp_path, monkeypatch, capsys):

@@ -214,22 +214,22 @@ class _Summary:
             "file": str(self._path),
             "seconds": round(time.monotonic() - self._begin, 3),
             "recorded": dict(self._recorder.sink.counts),
-            "cycles_without_sample": self._missed(),
+            **{f"cycles_without_{kind}": n for kind, n in self._missed().items()},
             "no_samples_because": self._why() or None,
         }
 
     def text(self) -> str:
         """Return recorded counts as text."""
         counts = [f"{n} {_PLURAL[kind]}" for kind, n in self._recorder.sink.counts.items() if n]
-        missed = self._missed()
-        lost = f", {missed} cycles without sample" if missed else ""
+        lost = "".join(f", {n} cycles without {kind}" for kind, n in self._missed().items() if n)
         refused = sum(tap.refused for tap in self._recorder.taps if isinstance(tap, ZenohTap))
         lost += f", {refused} messages of others ignored" if refused else ""
         lost += f", no samples: {why}" if (why := self._why()) else ""
         return f"{', '.join(counts) or 'nothing yet'} in {time.monotonic() - self._begin:.0f} s{lost}"
 
-    def _missed(self) -> int:
-        return sum(tap.missed for tap in self._recorder.taps if isinstance(tap, ZenohTap))
+    def _missed(self) -> dict[str, int]:
+        taps = [tap for tap in self._recorder.taps if isinstance(tap, ZenohTap)]
+        return {kind: sum(tap.missed[kind] for tap in taps) for kind in ("sample", "estimate")}
 
     def _why(self) -> str:
         taps = self._recorder.taps

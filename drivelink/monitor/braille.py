@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from rich.text import Text
 
 from drivelink.monitor.history import usual_range
-from drivelink.output.numbers import axis_ticks
+from drivelink.output.numbers import axis_ticks, ticks_on_rows
 
 _BARS = "▁▂▃▄▅▆▇█"
 # Bit of the dot at column c (0, 1) and row r (0 on top) of a braille character.
@@ -53,12 +53,11 @@ class DotPlot:
     """
 
     def __init__(self, width: int, height: int, x: tuple[float, float], y: tuple[float, float]) -> None:
-        self._x, self._y = _opened(*x), _opened(*y)
         self.rows = max(2, height - 2)
+        self._x = _opened(*x)
+        self._y, ticks = ticks_on_rows(*_opened(*y), self.rows)
         low, high = self._y
-        self._labels = {
-            round((high - y) / (high - low) * (self.rows - 1)): label for y, label in axis_ticks(low, high)
-        }
+        self._labels = {round((high - y) / (high - low) * (self.rows - 1)): label for y, label in ticks}
         self._margin = max(6, *map(len, self._labels.values()))
         self.columns = max(4, width - self._margin - 1)
         self._cells = [[0] * self.columns for _ in range(self.rows)]
@@ -131,18 +130,19 @@ class DotPlot:
     def _below(self, unit: str) -> str:
         """Return the labels of the x axis, each below its place, the last one with the unit."""
         ticks = axis_ticks(*self._x)
-        strides = (self._laid(ticks[::stride], unit) for stride in range(1, len(ticks) + 1))
-        return next((axis for axis in strides if axis is not None), "")
+        count = len(ticks)
+        laid = (self._laid(ticks[:n:k], unit) for k in range(1, count + 1) for n in (count, count - 1))
+        return next((axis for axis in laid if axis is not None), "")
 
     def _laid(self, ticks: Sequence[tuple[float, str]], unit: str) -> str | None:
-        """Return the labels as a line; None where they do not fit."""
+        """Return the labels as a line; None where they do not fit, or one is not below its place."""
         low, high = self._x
         axis = ""
         for k, (x, label) in enumerate(ticks):
             text = f"{label} {unit}".rstrip() if k == len(ticks) - 1 else label
-            place = round((x - low) / (high - low) * (self.columns - 1)) - len(label) // 2
-            place = max(0, min(place, self.columns - len(text)))
-            if place < len(axis) + bool(axis):
+            at = round((x - low) / (high - low) * (self.columns - 1))
+            place = max(0, min(at - len(label) // 2, self.columns - len(text)))
+            if place < len(axis) + bool(axis) or at > place + len(label) + 1:
                 return None
             axis = axis.ljust(place) + text
         return axis

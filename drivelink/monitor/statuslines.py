@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
+from textwrap import wrap
 from typing import Any, NamedTuple
 
 from rich.text import Text
@@ -114,7 +115,7 @@ def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> 
         rate=f"{rate:.0f} Hz" if rate is not None else "",
         missed=f"{missed:.0f}{total}" if missed is not None else "",
         cpu=f"{100 * cpu:.0f} %" if cpu is not None else "",
-        load=f"{100 * load:.0f} %" if load is not None else "",
+        load=f"{100 * load:.0f} %" if load is not None and status.get("state") != "bus lost" else "",
         times=tuple((name, p99) for name, p99 in times if p99 is not None),
         nodes=tuple(
             _node(name, nodes[name], heard=status.get("state") != "bus lost")
@@ -279,7 +280,7 @@ def status_lines(
     model: Mapping[str, Any] | None = None,
     finding: Mapping[str, Any] | None = None,
 ) -> list[Text]:
-    """Return seven lines at most: cycle, nodes, residual, why not valid, advice, problems, the finding."""
+    """Return cycle, nodes and residual; why not valid, advice, problems and the finding in two lines each."""
     if not status:
         return []
     shown = shape(status, model)
@@ -295,10 +296,15 @@ def status_lines(
     ]
     lines = []
     for label, parts in rows:
+        if len(parts) == 1:
+            text, style = parts[0]
+            halves = wrap(text, max(width - _LABEL, 8), max_lines=2, placeholder=" …")
+            parts = [("\n".ljust(_LABEL + 1).join(halves), style)]
         if any(text for text, _ in parts):
-            line = Text.assemble((f"{label:<{_LABEL}}", "dim"), *parts, no_wrap=True)
-            line.truncate(width, overflow="ellipsis")
-            lines.append(line)
+            whole = Text.assemble((f"{label:<{_LABEL}}", "dim"), *parts, no_wrap=True)
+            for line in whole.split("\n"):
+                line.truncate(width, overflow="ellipsis")
+                lines.append(line)
     return lines
 
 

@@ -55,7 +55,7 @@ def joints_table(views: Mapping[str, JointView], width: int) -> Table:
 
 def can_draw(console: Console) -> bool:
     """Return whether the console is a terminal that has the characters of the live views."""
-    return console.is_terminal and not console.options.ascii_only
+    return console.is_terminal and not console.is_dumb_terminal and not console.options.ascii_only
 
 
 class Keys:

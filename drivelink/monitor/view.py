@@ -183,11 +183,13 @@ class JointView:
         if self.state:
             title.append(f" · {self.state}", style="" if self.live else "bold red")
         numbers = self._numbers(width - 4)
-        below = status_lines(self.status, width - 4, self.model, self.finding) if self.live else []
+        room = height - 2 - numbers.row_count - 1
+        below = status_lines(self.status, width - 4, self.model, self.finding)[: max(0, room - 1)]
+        below = below if self.live else []
         if self.history.latest is not None:
             below.append(self._flags())
-        room = height - 2 - numbers.row_count - len(below) - 1
-        body: list[RenderableType] = [numbers, Text("")]
+        room -= len(below)
+        body: list[RenderableType] = [numbers, *([Text("")] if room >= 0 else [])]
         if self.help:
             body, below = [self._legend()], []
         elif room >= 5 and self.history.latest is not None:
@@ -213,9 +215,8 @@ class JointView:
         known = math.isfinite(last.true_stiffness_nm_rad)
         spark = width - (78 if known else 69)
         table = Table.grid(padding=(0, 2, 0, 0))
-        # Where it is narrower, an ellipsis ends a number: half of one is another one.
-        for least in (10, 25, 26):
-            table.add_column(no_wrap=True, min_width=least if width >= 70 else None)
+        for least in (10, 25, 26)[: 3 if width >= 65 else 2]:
+            table.add_column(no_wrap=True, min_width=least)
         if spark >= 4:
             table.add_column(no_wrap=True, ratio=1)
         ink = ESTIMATE if self.live and last.valid else "dim"

@@ -21,12 +21,30 @@ def number(value: float, digits: int = 4) -> str:
 
 def axis_ticks(low: float, high: float) -> list[tuple[float, str]]:
     """Return three to eight round places of an axis, with labels of one power of ten."""
+    return next(ticks for step in _steps(low, high) if len(ticks := _ticks(low, high, step)) >= 3)
+
+
+def ticks_on_rows(low: float, high: float, rows: int) -> tuple[tuple[float, float], list[tuple[float, str]]]:
+    """Return the least wider range whose round places lie on rows, evenly apart, and these places."""
+    found = [((low, high), axis_ticks(low, high))]
+    for step in _steps(low, high):
+        for apart in range(1, rows // 2 + 1):
+            row = step / apart
+            top = math.ceil(high / row - 1e-9) * row
+            bottom = top - (rows - 1) * row
+            if bottom <= low + 1e-9 * row and 3 <= len(ticks := _ticks(bottom, top, step)) <= 8:
+                found.append(((bottom, top), ticks))
+    return min(found[1:] or found, key=lambda axis: axis[0][1] - axis[0][0])
+
+
+def _steps(low: float, high: float) -> list[float]:
     power = 10.0 ** math.ceil(math.log10(high - low))
-    for step in (f * power for f in (0.5, 0.2, 0.1, 0.05, 0.02)):
-        places = [k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
-        if len(places) >= 3:
-            break
-    largest, last = max(map(abs, places)), math.floor(math.log10(step) + 1e-9)
+    return [f * power for f in (0.5, 0.2, 0.1, 0.05, 0.02)]
+
+
+def _ticks(low: float, high: float, step: float) -> list[tuple[float, str]]:
+    places = [k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+    largest, last = max(map(abs, places), default=0.0), math.floor(math.log10(step) + 1e-9)
     return [(place, _to_place(place, largest, last) if place else "0") for place in places]
 
 

@@ -69,9 +69,9 @@ class ZenohTap:
     ) -> None:
         self._sink = sink
         self._gate = gate or FirstSource(sink)
-        self.missed = 0  # cycles without sample
+        self.missed = dict.fromkeys(("sample", "estimate"), 0)  # cycles without one
         self._impossible = 0
-        self._sequence = -1
+        self._sequence: dict[str, int] = {}
         self._motors = len(joint.motor)
         self._identity = DaemonIdentity()
         self._heard_s = -math.inf
@@ -123,15 +123,13 @@ class ZenohTap:
     def _sample(self, message: zenoh.Sample) -> None:
         sample, stamp_ns = DECODERS["sample"](message.payload.to_bytes())
         self._require_motors(len(sample.motor_position_rad))
-        step = sample.sequence - self._sequence
-        if self._sequence >= 0 and step > 1:
-            self.missed += step - 1
-        self._sequence = sample.sequence
+        self._count("sample", sample.sequence)
         self._gate.sample(self, sample, stamp_ns)
 
     def _estimate(self, message: zenoh.Sample) -> None:
         estimate = DECODERS["estimate"](message.payload.to_bytes())
         self._require_motors(len(estimate.transmissions))
+        self._count("estimate", estimate.sequence)
         self._sink.estimate(estimate)
 
     def _external(self, message: zenoh.Sample) -> None:
@@ -147,6 +145,11 @@ class ZenohTap:
         name = str(message.key_expr).rpartition("/")[2]
         document = DECODERS[name](message.payload.to_bytes())
         self._sink.document(name, json.dumps(document).encode(), time.time_ns())
+
+    def _count(self, kind: str, sequence: int) -> None:
+        """Count the cycles since the last one of its kind."""
+        self.missed[kind] += max(0, sequence - self._sequence.get(kind, sequence) - 1)
+        self._sequence[kind] = sequence
 
     def _require_motors(self, motors: int) -> None:
         if motors != self._motors:

@@ -146,4 +146,5 @@ def test_what_is_wrong_is_one_line(tmp_path, capsys):
     joint.write_text(joint.read_text().replace("[-0.6, 0.6]", "[0.6, -0.6]"))
     assert cli.main(asked) != 0
     errors = capsys.readouterr().err.strip().splitlines()
-    assert len(errors) == 5 and "--motion: " in errors[3] and "[lowest, highest]" in errors[3] and "columns time_s" in errors[2]
+    assert len(errors) == 5 and "--motion: " in errors[3]
+    assert "[lowest, highest]" in errors[4] and "columns time_s" in errors[2]

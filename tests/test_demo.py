@@ -20,10 +20,9 @@ from zenohkit import LIMIT_S, until
 
 from drivelink import cli, jointfile
 from drivelink.demo.closedloop import CASES, STEPS, ClosedLoop
-from drivelink.demo.closing import Comparison, as_json
-from drivelink.demo.closing import closing as closing_section
 from drivelink.demo.rig import RunSummary
-from drivelink.demo.watching import DemoRun, RigProcess
+from drivelink.demo.watching import Comparison, DemoRun, RigProcess, as_json
+from drivelink.demo.watching import closing as closing_section
 from drivelink.monitor.history import TruePoint
 from drivelink.monitor.view import JointView
 from drivelink.output.document import show

@@ -185,7 +185,7 @@ def test_the_page_gets_each_external_torque_once_and_a_gap_where_it_is_not_valid
         assert {tuple(rest) for t, *rest in displayed["touches"] if begin <= 1e3 * t < end} == {expected}
     assert 3.0 in times  # the begin of a contact is not thinned out
     assert displayed["external"] == [3.999, 0.5, 0.1, True, True]
-    assert ("contact", "yellow") in displayed["estimate"]["flags"]
+    assert ["contact", "yellow"] in displayed["estimate"]["flags"]
     assert json.dumps(displayed, allow_nan=False)
     assert snapshot(view, True, since)["touches"] == []  # they have been given
     for k in range(10):  # a daemon that starts anew
@@ -309,7 +309,7 @@ def test_a_daemon_that_is_silent_or_gone_leaves_no_green_and_no_live_numbers():
     assert "daemon gone, last estimate 12 s ago" in text
     assert "operational" not in text and "● valid" not in text
     displayed = snapshot(view, False, {})
-    assert not displayed["live"] and displayed["estimate"]["flags"] == [(view.state, "bold red")]
+    assert not displayed["live"] and displayed["estimate"]["flags"] == [[view.state, "bold red"]]
     assert "daemon gone" in view.line() and "observable" not in view.line()
 
 

@@ -16,8 +16,7 @@ from drivelink import jointfile
 from drivelink.cli import add_number
 from drivelink.cli.blackbox import black_box
 from drivelink.demo import closedloop
-from drivelink.demo.closing import as_json, closing
-from drivelink.demo.watching import DemoRun, rig_process
+from drivelink.demo.watching import DemoRun, as_json, closing, rig_process
 from drivelink.errors import DrivelinkError
 from drivelink.monitor.terminal import can_draw
 from drivelink.output.document import show

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import sys
 import time
@@ -9,17 +10,158 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from rich.console import Console
 from rich.live import Live
 
-from drivelink.demo.closing import Comparison
 from drivelink.demo.rig import Change, Failure, RunSummary, serve
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile
+from drivelink.monitor.history import TruePoint
 from drivelink.monitor.view import JointView
+from drivelink.output.document import Grid, Paragraph, Rows, Section
+from drivelink.output.numbers import number, value_and_interval
 from drivelink.pubsub.client import Subscription
+from drivelink.pubsub.publisher import finite
+from drivelink.pubsub.wire import EstimateMessage
+from estimator.sample import SIGMA_95, Status
+
+T = TypeVar("T")
+
+_UNMATCHED = 5_000  # sequence numbers kept while waiting for the other side
+
+
+class RmsErrors(NamedTuple):
+    """Root-mean-square errors over the cycles whose estimate is valid, relative to the truth's rms."""
+
+    cycles: int  # number of compared cycles
+    stiffness: float  # relative error of the stiffness
+    flexibility_torque: float  # relative error of the flexibility torque
+    covered: float  # fraction of the cycles whose 95 % interval of the stiffness holds the truth
+
+
+class Comparison:
+    """Pairs received estimates with the truth.
+
+    Attributes:
+        latest: the last pair, for a view.
+    """
+
+    def __init__(self) -> None:
+        self.latest: tuple[EstimateMessage, TruePoint] | None = None
+        self._estimates: dict[int, EstimateMessage] = {}
+        self._truth: dict[int, TruePoint] = {}
+        self._cycles = self._covered = 0
+        self._sums = [0.0, 0.0, 0.0, 0.0]  # squared errors and squared truths: stiffness, torque
+
+    def received(self, estimate: EstimateMessage) -> None:
+        """Enter a received estimate."""
+        truth = self._truth.pop(estimate.sequence, None)
+        if truth is not None:
+            self._pair(estimate, truth)
+        else:
+            _keep(self._estimates, estimate.sequence, estimate)
+
+    def known(self, truth: TruePoint) -> None:
+        """Enter the truth at one SYNC."""
+        estimate = self._estimates.pop(truth.sequence, None)
+        if estimate is not None:
+            self._pair(estimate, truth)
+        else:
+            _keep(self._truth, truth.sequence, truth)
+
+    def errors(self) -> RmsErrors:
+        """Return errors over all pairs so far; NaN before the first valid estimate."""
+        if self._cycles == 0:
+            return RmsErrors(0, math.nan, math.nan, math.nan)
+        stiffness, true_stiffness, torque, true_torque = self._sums
+        return RmsErrors(
+            self._cycles,
+            math.sqrt(stiffness / true_stiffness) if true_stiffness else math.nan,
+            math.sqrt(torque / true_torque) if true_torque else math.nan,
+            self._covered / self._cycles,
+        )
+
+    def _pair(self, estimate: EstimateMessage, truth: TruePoint) -> None:
+        self.latest = estimate, truth
+        if not estimate.status & Status.VALID:
+            return
+        off = estimate.stiffness_nm_rad - truth.stiffness_nm_rad
+        self._cycles += 1
+        self._covered += abs(off) <= SIGMA_95 * estimate.stiffness_std_nm_rad
+        sums = self._sums
+        sums[0] += off**2
+        sums[1] += truth.stiffness_nm_rad**2
+        sums[2] += (estimate.flexibility_torque_nm - truth.flexibility_torque_nm) ** 2
+        sums[3] += truth.flexibility_torque_nm**2
+
+
+def _keep(waiting: dict[int, T], sequence: int, item: T) -> None:
+    waiting[sequence] = item
+    if len(waiting) > _UNMATCHED:
+        del waiting[next(iter(waiting))]
+
+
+def closing(
+    case: str, comparison: Comparison, summary: RunSummary, received: int, period_s: float
+) -> Section:
+    """Return the last pair of truth and estimate, the errors of the whole run, and the cycle's figures."""
+    errors = comparison.errors()
+    rows: Rows = []
+    lines: list[str] = []
+    if comparison.latest is not None:
+        estimate, truth = comparison.latest
+        value, half = value_and_interval(estimate.stiffness_nm_rad, SIGMA_95 * estimate.stiffness_std_nm_rad)
+        torques = (number(one.flexibility_torque_nm) for one in (truth, estimate))
+        rows += [
+            ("stiffness / N·m/rad", number(truth.stiffness_nm_rad, 5), value, f"± {half}" if half else "",
+             _percent(errors.stiffness)),
+            ("flexibility torque / N·m", *torques, "", _percent(errors.flexibility_torque)),
+        ]  # fmt: skip
+        doubt = "" if estimate.status & Status.VALID else ", which is not valid"
+        lines.append(f"truth, estimate and its 95 % interval: of the last cycle{doubt}")
+    if errors.cycles:
+        over = f"rms error: over all {errors.cycles} valid cycles ({errors.cycles * period_s:.1f} s), "
+        lines.append(f"{over}relative to the truth's rms")
+    elif not received:
+        lines.append("no estimate came over zenoh: is there no loopback interface?")
+    else:
+        lines.append("no valid cycle, so no error: an estimate is valid after some seconds of motion")
+    lines += [
+        f"{summary.cycles} cycles, {summary.missed_cycles} missed, {received} estimates received over zenoh",
+        f"a cycle's work p99 {summary.work_p99_us:.0f} µs, SYNC late by p99 {summary.lateness_p99_us:.0f} µs",
+    ]
+    if errors.cycles:
+        held = f"the 95 % interval held the truth in {_percent(errors.covered)}"
+        lines.append(f"{held} of {errors.cycles} valid cycles")
+    grid = Grid(("", "truth", "estimate", "95 %", "rms error"), rows)
+    return Section(f"{case}: truth beside estimate", [*([grid] if rows else []), *map(Paragraph, lines)])
+
+
+def as_json(case: str, comparison: Comparison, summary: RunSummary, received: int) -> dict[str, Any]:
+    """Return the same as a JSON object; missing numbers are null."""
+    errors = comparison.errors()
+    document: dict[str, Any] = finite(
+        {
+            "case": case,
+            "cycles": summary.cycles,
+            "missed_cycles": summary.missed_cycles,
+            "received": received,
+            "valid_cycles": errors.cycles,
+            "stiffness_error_relative": errors.stiffness,
+            "flexibility_torque_error_relative": errors.flexibility_torque,
+            "stiffness_interval_coverage": errors.covered,
+            "work_p99_us": summary.work_p99_us,
+            "lateness_p99_us": summary.lateness_p99_us,
+        }
+    )
+    return document
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.3g} %" if math.isfinite(value) else "–"
+
 
 _PATIENCE_S = 20.0  # for the other process to start, and to end
 _LINE_S, _FRAME_S = 1.0, 0.125  # between plain lines, and pictures on a terminal

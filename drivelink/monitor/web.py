@@ -13,7 +13,7 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
@@ -24,7 +24,7 @@ from typing import Any
 from drivelink.errors import UsageError, ZenohError
 from drivelink.loop import finding as findings
 from drivelink.loop.acceptance import accepted_at
-from drivelink.monitor.history import Moment, Touch, model_curves
+from drivelink.monitor.history import Touch, model_curves
 from drivelink.monitor.statuslines import Shown, finding_age, shape
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
@@ -33,6 +33,7 @@ from drivelink.monitor.webday import WebDay
 from drivelink.monitor.webserver import PATIENCE_S, Server
 from drivelink.output.numbers import number
 from drivelink.pubsub.feed import decode_document
+from drivelink.pubsub.publisher import finite, to_json
 from estimator.sample import Sample
 
 MAX_STREAMS = 8
@@ -140,7 +141,7 @@ class WebView:
                     "acceptable": True,
                     "undoable": bool(accepted_at(view.model)),
                 }
-        return json.dumps({"joints": joints}, allow_nan=False).encode()
+        return to_json({"joints": joints})
 
 
 def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str, Any]:
@@ -162,25 +163,27 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
     if fresh:
         since[view.name] = fresh[-1].time_s
     shown = shape(view.status or {}, view.model)
-    return {
+    fields = {
         **_now(view),
         "alive": alive,
         "status": _describe(shown),
         "finding": _finding(view.finding, shown),
         "restart": last == -math.inf,
-        "moments": [_moment(moment) for moment in fresh],
-        "residuals": _points(residuals),
+        "moments": [(*moment[:4], moment.valid) for moment in fresh],
+        "residuals": residuals,
         "touches": [_touch(touch) for touch in touches],
         "signals": [_signals(*pair) for pair in history.signals if last < pair[0] <= newest],
-        "curves": [_points(points) for points in curves],
-        "doubtful": [_points(points) for points in grey],
-        "model": [_points(points) for points in model_curves(view.model, curves if any(curves) else grey)],
+        "curves": curves,
+        "doubtful": grey,
+        "model": model_curves(view.model, curves if any(curves) else grey),
     }
+    return {name: finite(value) for name, value in fields.items()}
 
 
 def document(view: JointView) -> dict[str, Any]:
     """Return a joint's present state for `monitor --json`; non-finite values are null."""
-    return {"joint": view.name, "time": time.time(), **_now(view), "status": view.status}
+    state: dict[str, Any] = finite(_now(view))
+    return {"joint": view.name, "time": time.time(), **state, "status": view.status}
 
 
 def _now(view: JointView) -> dict[str, Any]:
@@ -195,38 +198,24 @@ def _now(view: JointView) -> dict[str, Any]:
     estimate = view.history.latest
     if estimate is not None:
         event["estimate"] = {
-            "stiffness": _finite(estimate.stiffness_nm_rad),
-            "std": _finite(estimate.stiffness_std_nm_rad),
-            "torque": _finite(estimate.flexibility_torque_nm),
-            "transmissions": [[_finite(value) for value in one] for one in estimate.transmissions],
+            "stiffness": estimate.stiffness_nm_rad,
+            "std": estimate.stiffness_std_nm_rad,
+            "torque": estimate.flexibility_torque_nm,
+            "transmissions": estimate.transmissions,
             "flags": view.flags,
         }
     return event
 
 
-def _points(points: Sequence[Sequence[float]]) -> list[list[float | None]]:
-    return [[_finite(value) for value in point] for point in points]
+def _touch(touch: Touch) -> tuple[float, ...]:
+    """(time, external torque, standard deviation, contact, valid)."""
+    return (*touch[:3], touch.valid and touch.contact, touch.valid)
 
 
-def _moment(moment: Moment) -> list[float | bool | None]:
-    """[time, torque, stiffness, standard deviation, valid]."""
-    return [*(_finite(value) for value in moment[:4]), moment.valid]
-
-
-def _touch(touch: Touch) -> list[float | bool | None]:
-    """[time, external torque, standard deviation, contact, valid]."""
-    contact = touch.valid and touch.contact
-    return [touch.time_s, _finite(touch.torque_nm), _finite(touch.std_nm), contact, touch.valid]
-
-
-def _signals(time_s: float, sample: Sample) -> list[Any]:
-    """[time, torque of each motor, position of each, velocity of each, position of the link]."""
+def _signals(time_s: float, sample: Sample) -> tuple[Any, ...]:
+    """(time, torque of each motor, position of each, velocity of each, position of the link)."""
     motors = sample.motor_torque_nm, sample.motor_position_rad, sample.motor_velocity_rad_s
-    return [
-        time_s,
-        *([_finite(value) for value in each] for each in motors),
-        _finite(sample.link_position_rad),
-    ]
+    return (time_s, *motors, sample.link_position_rad)
 
 
 def _describe(shown: Shown) -> dict[str, Any]:
@@ -376,7 +365,3 @@ class _Handler(BaseHTTPRequestHandler):
                     over.wait(max(0.0, _EVENT_S - (time.monotonic() - begin)))
         except OSError:  # the browser has closed the connection or stopped reading
             return
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -273,20 +273,21 @@ def to_json(document: Mapping[str, Any]) -> bytes:
     try:
         text = json.dumps(document, allow_nan=False, default=_plain)
     except ValueError:
-        text = json.dumps(_finite(document), allow_nan=False, default=_plain)
+        text = json.dumps(finite(document), allow_nan=False, default=_plain)
     return text.encode()
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """Return a value, or what it consists of, with None for every number that is not finite."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return value
 
 
 def _plain(value: Any) -> Any:
     """Convert numpy numbers and arrays to plain values, anything else to text."""
-    return _finite(value.tolist()) if hasattr(value, "tolist") else str(value)
+    return finite(value.tolist()) if hasattr(value, "tolist") else str(value)

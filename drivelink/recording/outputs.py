@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from array import array
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from drivelink.errors import RecordingError
 from drivelink.output.numbers import with_interval
-from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.publisher import JointPublisher, finite
 from drivelink.recording.messages import (
     estimate_columns,
     estimate_row,
@@ -205,10 +204,8 @@ class Summary:
     def document(self) -> dict[str, Any]:
         """Return the summary of the replay as a JSON document; non-finite values are None."""
         estimate = self._last.tick.estimate if self._last is not None else None
-        end = {
-            name: value if estimate is not None and math.isfinite(value := getattr(estimate, name)) else None
-            for name in ("stiffness_nm_rad", "stiffness_std_nm_rad", "flexibility_torque_nm")
-        }
+        names = ("stiffness_nm_rad", "stiffness_std_nm_rad", "flexibility_torque_nm")
+        end = finite({name: getattr(estimate, name, None) for name in names})
         seconds = self._last.time_s - self._first_s if self._last is not None else 0.0
         counts = {
             "cycles": self.count,

@@ -229,7 +229,7 @@ class McapMessages:
     def __next__(self) -> McapMessage: ...
 
 class SdoTransfers:
-    """Follows the SDO channel of one node; see `drivelink.canopen.sdo_sniffer`.
+    """Follows the SDO channel of one node; see `drivelink.canopen.sdo.SdoSniffer`.
 
     Args:
         interesting: whether to keep the value of an object (index, subindex).

@@ -16,7 +16,7 @@ from zenohkit import make_estimate, make_external, make_sample
 from drivelink._core import encode_estimate, encode_external, encode_sample
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.emcy import parse_emergency
-from drivelink.canopen.sdo_sniffer import SdoSniffer
+from drivelink.canopen.sdo import SdoSniffer
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import load, parse
 from drivelink.pubsub import wire

@@ -6,7 +6,7 @@ from canopenkit import eds_text, joint_text, signals
 from drivelink._core import Assembler
 from drivelink.canopen.layout import Signal
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.canopen.sdo_sniffer import SdoSniffer, written_object
+from drivelink.canopen.sdo import SdoSniffer, written_object
 from drivelink.cycle.following import PassiveFollower
 from drivelink.cycle.objectcheck import _Node
 from drivelink.errors import DriveError

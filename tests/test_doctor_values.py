@@ -13,9 +13,8 @@ from drivelink.canopen.layout import Signal, roles
 from drivelink.canopen.node import survey_node
 from drivelink.cli import main
 from drivelink.doctor import Section
-from drivelink.doctor.interface import examine_interface, judge_link
 from drivelink.doctor.livevalues import Asked, Series, record_of
-from drivelink.doctor.machine import Daemons, examine_machine, judge_sync
+from drivelink.doctor.machine import Daemons, examine_interface, examine_machine, judge_link, judge_sync
 from drivelink.doctor.motion import judge_motion
 from drivelink.jointfile import BusSection, parse
 from drivelink.notice import Severity

@@ -9,7 +9,7 @@ from functools import partial
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.layout import NodeLayout, Offer, Role, Signal
 from drivelink.canopen.pdo import OPTIONAL, Tpdo, decode, describe, objects_of, tpdos_of
-from drivelink.canopen.sdo_sniffer import SdoSniffer, is_mapping, written_object
+from drivelink.canopen.sdo import SdoSniffer, is_mapping, written_object
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import VENDORS, vendor_of
 from drivelink.errors import DriveError

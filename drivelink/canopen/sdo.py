@@ -14,6 +14,7 @@ from typing import Generic, TypeVar
 
 from canopen.sdo.exceptions import SdoAbortedError
 
+from drivelink._core import SdoTransfers
 from drivelink.canopen.guard import check_frame
 from drivelink.errors import DriveError
 
@@ -340,3 +341,42 @@ class Session(Generic[T]):
     def _put(self, cob_id: int, data: bytes) -> None:
         check_frame(cob_id, data)
         self._send(cob_id, data)
+
+
+Address = tuple[int, int]
+
+_DOWNLOAD, _BLOCK_DOWNLOAD = 1, 6  # commands of the client
+
+
+class SdoSniffer(SdoTransfers):
+    """Reads another master's transfers with one node from the traffic (CiA 301, 7.2.4.3).
+
+    An answer is used only if it belongs to a request that was heard: of the same object, in order, within the
+    time-out. Every other one is counted and ignored. Where two different answers follow one request, or a
+    download is given up before its answer, the object's value is not known: it is disputed until it is
+    transferred again. A download counts once the node has confirmed it. The object of a block download is
+    disputed: its bytes are not followed.
+    """
+
+    def forget(self, lost: Callable[[Address], bool]) -> None:
+        """Handle a restart of the node: forget written values and those that `lost` selects."""
+        self.drop_transfer()
+        for address in [a for a in self.values if a in self.written or lost(a)]:
+            del self.values[address]
+        self.written.clear()
+        self.disputed.difference_update([address for address in self.disputed if lost(address)])
+        self.changes += 1
+
+
+def is_mapping(address: Address) -> bool:
+    """Return whether an object is a parameter of a TPDO (CiA 301, 7.5.2.37 and 38)."""
+    return 0x1800 <= address[0] <= 0x1BFF
+
+
+def written_object(data: bytes) -> Address | None:
+    """Return the object that a frame of the master begins to write."""
+    begins = data and (data[0] >> 5 == _DOWNLOAD or data[0] & 0xE1 == _BLOCK_DOWNLOAD << 5)
+    if not begins or len(data) > 8:
+        return None
+    data = data.ljust(8, b"\0")  # some masters send fewer
+    return data[1] | data[2] << 8, data[3]

@@ -22,8 +22,7 @@ from drivelink.recording.columns import parse_column_map
 from drivelink.recording.corrections import Gathered, gate
 from drivelink.recording.formats import FORMATS
 from drivelink.recording.mapping import joint_of
-from drivelink.recording.outputs import EstimatesFile, Publication, Summary
-from drivelink.recording.playback import Playback, Played, open_playback
+from drivelink.recording.playback import EstimatesFile, Playback, Played, Publication, Summary, open_playback
 
 Sink = Callable[[Played], None]
 

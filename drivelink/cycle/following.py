@@ -15,7 +15,7 @@ from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.configure import Configurator
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.canopen.sdo_sniffer import is_mapping, written_object
+from drivelink.canopen.sdo import is_mapping, written_object
 from drivelink.cycle.objectcheck import Mismatch, ObjectCheck, RecentSamples
 from drivelink.errors import DriveError
 

@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 
 from drivelink._core import Assembler
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal
-from drivelink.canopen.sdo import Pause, Program, Read, Session
-from drivelink.canopen.sdo_sniffer import SdoSniffer
+from drivelink.canopen.sdo import Pause, Program, Read, SdoSniffer, Session
 from drivelink.errors import DriveError
 from estimator.sample import Sample
 

@@ -15,7 +15,7 @@ from drivelink.canopen.configure import Configurator
 from drivelink.canopen.emcy import NMT_STATES, nmt_state, parse_emergency
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.canopen.sdo_sniffer import is_mapping, written_object
+from drivelink.canopen.sdo import is_mapping, written_object
 from drivelink.cycle.following import MapFollower, PassiveFollower
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.objectcheck import ObjectCheck, ReadBack

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from drivelink.doctor.datasheet import examine_sheet
-from drivelink.doctor.interface import can_interfaces, examine_interface
-from drivelink.doctor.machine import examine_machine, examine_zenoh
+from drivelink.doctor.machine import can_interfaces, examine_interface, examine_machine, examine_zenoh
 from drivelink.doctor.nodes import examine_bus
 from drivelink.doctor.report import Report, Section
 from drivelink.jointfile import JointFile

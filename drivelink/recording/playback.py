@@ -1,24 +1,39 @@
-"""Plays a recording through the pipeline of live data: frames or samples in, estimates out."""
+"""Plays a recording through the pipeline of live data, and writes, publishes and counts what comes out."""
 
 from __future__ import annotations
 
 import logging
+import time
+from array import array
 from collections.abc import Callable, Iterable, Iterator
 from itertools import dropwhile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from drivelink._core import Assembler, JointPipeline, Tick
 from drivelink.cycle.pipeline import build
-from drivelink.errors import DrivelinkError
+from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import JointFile
+from drivelink.output.numbers import with_interval
+from drivelink.pubsub.publisher import JointPublisher, finite
 from drivelink.recording import read
 from drivelink.recording.canframes import FrameLog, is_frame_log
 from drivelink.recording.columns import ColumnMap
 from drivelink.recording.cycles import Cycle, estimated
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, recorded_cycles
-from estimator.sample import Sample
+from drivelink.recording.messages import (
+    estimate_columns,
+    estimate_row,
+    external_columns,
+    external_row,
+)
+from drivelink.recording.sinks import SafeFile
+from estimator.online import Estimator
+from estimator.reasons import percent, why_not_valid
+from estimator.sample import SIGMA_95, FloatArray, Sample, Status
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -139,3 +154,208 @@ def _after(
 def _played(ticks: Iterable[Tick], period_s: float) -> Iterator[Played]:
     for tick in ticks:
         yield Played(tick.sequence * period_s, tick)
+
+
+_STATUS_EVERY_S = 0.25
+_ROWS = 2048  # rows per write
+# Plain integers: an IntFlag costs a microsecond.
+_VALID, _OBSERVABLE, _TORQUE_VALID = int(Status.VALID), int(Status.OBSERVABLE), int(Status.TORQUE_VALID)
+
+
+def _columns(motors: int) -> tuple[str, ...]:
+    """Names of a cycle's values, in the order of `_row`."""
+    return (*estimate_columns(motors), "valid", "status", "torque_valid", "flexibility_torque_std_nm")
+
+
+def _row(played: Played, estimator: Estimator) -> tuple[float, ...]:
+    """Return a cycle, the last of the estimator, as the values of `_columns`."""
+    estimate = played.tick.estimate
+    totals = (estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad)
+    row = estimate_row(played.time_s, estimate.status, totals, estimate.transmissions)
+    torque_valid, std = int(bool(estimate.status & _TORQUE_VALID)), estimator.flexibility_torque_std_nm
+    return (*row, estimate.status & _VALID, estimate.status, torque_valid, std)
+
+
+class EstimatesFile:
+    """Writes estimates.csv, one row per cycle; placed on `close`.
+
+    Args:
+        linked: with declared link dynamics; adds columns of the external torque.
+
+    Raises:
+        RecordingError: it cannot be opened or, later, written; an existing file is unchanged.
+    """
+
+    def __init__(
+        self, path: Path, motors: int, estimator: Estimator, *, linked: bool = False, force: bool = False
+    ) -> None:
+        columns = _columns(motors) + (external_columns() if linked else ())
+        self._linked, self._estimator = linked, estimator
+        self._line = ",".join(["%r"] * len(columns)) + "\n"
+        self._rows = [",".join(columns) + "\n"]
+        self._file = SafeFile(path, force=force)
+
+    def write(self, played: Played) -> None:
+        """Write one row."""
+        row = _row(played, self._estimator)
+        self._rows.append(self._line % (row + external_row(played.tick.external) if self._linked else row))
+        if len(self._rows) >= _ROWS:
+            self._write()
+
+    def close(self) -> None:
+        """Place the file, unless writing has failed."""
+        if not self._file.closed:
+            self._write()
+            self._file.close()
+
+    def _write(self) -> None:
+        self._file.write("".join(self._rows).encode("ascii"))
+        self._rows.clear()
+        try:
+            self._file.flush()
+        except RecordingError:
+            self._file.abandon()
+            raise
+
+
+class Publication:
+    """Publishes the cycles like the daemon, with present stamps.
+
+    Args:
+        speed: recorded seconds per second; None: as fast as possible.
+        about: text on the replay in the status document.
+    """
+
+    def __init__(self, publisher: JointPublisher | None, speed: float | None, about: dict[str, Any]) -> None:
+        self._publisher = publisher
+        self._speed = speed
+        self._about = about
+        self._begin_s = 0.0
+        self._begin_ns = self._begin_unix_ns = 0
+        self._status_due_s = 0.0
+        self._count = 0
+
+    def write(self, played: Played) -> None:
+        """Wait until a cycle is due, and publish it."""
+        if not self._count:
+            self._begin_s = played.time_s
+            self._begin_ns, self._begin_unix_ns = time.monotonic_ns(), time.time_ns()
+        self._count += 1
+        passed_s = played.time_s - self._begin_s
+        if self._speed is not None:
+            due_ns = self._begin_ns + round(passed_s / self._speed * 1e9)
+            wait_ns = due_ns - time.monotonic_ns()
+            if wait_ns > 0:
+                time.sleep(wait_ns * 1e-9)
+        if self._publisher is None:
+            return
+        stamp_ns = self._begin_unix_ns + round(passed_s / (self._speed or 1.0) * 1e9)
+        self._publisher.put(played.tick.stamped(stamp_ns))
+        if passed_s >= self._status_due_s:
+            self._status_due_s = passed_s + _STATUS_EVERY_S * (self._speed or 1.0)
+            self._status("replay", passed_s)
+
+    def close(self) -> None:
+        """Publish the end of the replay."""
+        if self._publisher is not None:
+            self._status("ended", self._status_due_s)
+
+    def _status(self, state: str, passed_s: float) -> None:
+        if self._publisher is not None:
+            status = {**self._about, "state": state, "time_s": passed_s, "cycles": self._count}
+            self._publisher.put_status(status)
+
+
+class Summary:
+    """Counts cycles, and why they are not valid; keeps the columns for plots."""
+
+    def __init__(self, motors: int, estimator: Estimator, keep: bool) -> None:
+        self._estimator = estimator
+        self._why: dict[str, tuple[int, str]] = {}  # by its key: cycles, the last sentence
+        self.count = self.fresh = self.valid = self.observable = 0
+        self._keep = keep
+        self._width = len(_columns(motors))
+        self._motors = motors
+        self._values = array("d")
+        self._last: Played | None = None
+        self._first_s = 0.0
+        self._sampled: tuple[int, ...] = ()  # number of the first sample, and of the last
+
+    def write(self, played: Played) -> None:
+        """Count one cycle."""
+        if not self.count:
+            self._first_s = played.time_s
+        self.count += 1
+        if played.tick.fresh:
+            sequence = played.tick.estimate.sequence
+            self._sampled = (self._sampled or (sequence,))[0], sequence
+            self.fresh += 1
+        status = played.tick.status
+        if status & _VALID:
+            self.valid += 1
+        elif (why := why_not_valid(status, self._estimator)) is not None:
+            self._why[why[0]] = self._why.get(why[0], (0, ""))[0] + 1, why[1]
+        self.observable += status & _OBSERVABLE != 0
+        self._last = played
+        if self._keep:
+            self._values.extend(_row(played, self._estimator))
+
+    def text(self, took_s: float) -> str:
+        """Return the replay in one line."""
+        if self._last is None:
+            return "no cycle in it"
+        seconds = self._last.time_s - self._first_s
+        estimate = self._last.tick.estimate
+        half = SIGMA_95 * estimate.stiffness_std_nm_rad
+        missing, periods = self._missing()
+        gaps = f"{missing} of {periods} samples missing, " if missing else ""
+        return (
+            f"{self.count} cycles, {gaps}{seconds:.6g} s, in {took_s:.3g} s "
+            f"({seconds / max(took_s, 1e-9):.3g} × real time); "
+            f"valid {100 * self.valid / self.count:.1f} %, "
+            f"observable {100 * self.observable / self.count:.1f} %; at the end stiffness "
+            f"{with_interval(estimate.stiffness_nm_rad, half, 'N·m/rad')}"
+        )
+
+    def _missing(self) -> tuple[int, int]:
+        """Return the periods without a sample, of how many from the first to the last one, as fit counts."""
+        periods = self._sampled[-1] - self._sampled[0] + 1 if self._sampled else 0
+        return max(periods - self.fresh, 0), periods
+
+    def reasons(self) -> list[str]:
+        """Return why cycles are not valid, most frequent first: share of the cycles, last sentence."""
+        shares = [(count / self.count, text) for count, text in self._sorted()]
+        return [
+            f"{'less than 0.1 %' if share < 0.001 else percent(share, 1)} of the cycles: {text}"
+            for share, text in shares
+        ]
+
+    def _sorted(self) -> list[tuple[int, str]]:
+        return sorted(self._why.values(), reverse=True)
+
+    def document(self) -> dict[str, Any]:
+        """Return the summary of the replay as a JSON document; non-finite values are None."""
+        estimate = self._last.tick.estimate if self._last is not None else None
+        names = ("stiffness_nm_rad", "stiffness_std_nm_rad", "flexibility_torque_nm")
+        end = finite({name: getattr(estimate, name, None) for name in names})
+        seconds = self._last.time_s - self._first_s if self._last is not None else 0.0
+        counts = {
+            "cycles": self.count,
+            "samples_missing": self._missing()[0],
+            "valid": self.valid,
+            "observable": self.observable,
+        }
+        why = [{"reason": text, "cycles": count} for count, text in self._sorted()]
+        return {"seconds": seconds, **counts, "not_valid": why, "end": end}
+
+    def plot(self, folder: Path, title: str) -> list[Path]:
+        """Write stiffness over deflection, and torque and stiffness over time."""
+        from drivelink.output.plots import plot_curves, plot_over_time  # matplotlib on demand
+
+        folder.mkdir(parents=True, exist_ok=True)
+        table = np.frombuffer(self._values, dtype=np.float64).reshape(-1, self._width)
+        columns: dict[str, FloatArray] = dict(zip(_columns(self._motors), table.T, strict=True))
+        return [
+            plot_curves(columns, self._motors, folder / "stiffness.png", title),
+            plot_over_time(columns, folder / "time.png", title),
+        ]

@@ -2,8 +2,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from drivelink.canopen.layout import NodeLayout
-from drivelink.cycle.pipeline import ResidualMonitor
 from drivelink.recording.canlog import LoggedFrame
+from estimator.model_monitor import ModelMonitor
 from estimator.online import Estimator
 from estimator.sample import Estimate, External, Sample
 
@@ -390,7 +390,7 @@ class JointPipeline:
         self,
         assembler: Assembler,
         estimator: Estimator,
-        model_monitor: ResidualMonitor | None = None,
+        model_monitor: ModelMonitor | None = None,
         *,
         keep: int = 0,
     ) -> None: ...
@@ -399,7 +399,7 @@ class JointPipeline:
     @property
     def estimator(self) -> Estimator: ...
     @property
-    def model_monitor(self) -> ResidualMonitor | None: ...
+    def model_monitor(self) -> ModelMonitor | None: ...
     @property
     def history(self) -> History: ...
     @property
@@ -485,5 +485,5 @@ class JointPipeline:
             The number of the last sample that it has seen now.
         """
 
-    def exchange(self, estimator: Any, model_monitor: ResidualMonitor | None) -> None:
+    def exchange(self, estimator: Any, model_monitor: ModelMonitor | None) -> None:
         """Put another estimator in place between two cycles."""

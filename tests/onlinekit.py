@@ -15,9 +15,9 @@ import joints
 import numpy as np
 
 from drivelink._core import Assembler, JointPipeline
-from drivelink.cycle.pipeline import ResidualMonitor
 from estimator import Estimator, EstimatorSettings, JointModel, Motor, Record, Sample, Status, Transmission
 from estimator import make_estimator as make_estimator
+from estimator.model_monitor import ModelMonitor
 from sim.cases import case
 from sim.effects import PlantEffect
 from sim.plant import JointPlant, Spring
@@ -192,7 +192,7 @@ def play(
     model: JointModel,
     samples: Iterable[Sample],
     *,
-    model_monitor: ResidualMonitor | None = None,
+    model_monitor: ModelMonitor | None = None,
     restarted: int | None = None,
     look: Callable[[int, Estimator], object] = lambda _k, _estimator: None,
     **settings: Any,

@@ -202,10 +202,10 @@ def test_a_joint_s_name_is_not_its_file(capsys, monkeypatch):
 
 
 def _numeric(verb):
-    parser = cli.make_parser([verb])
+    (verbs,) = cli.make_parser([verb])._subparsers._group_actions
     return [
         a
-        for a in cli._verb_parser(parser, verb)._actions
+        for a in verbs.choices[verb]._actions
         if a.option_strings and a.type not in (None, Path, cli.recording_path)
     ]
 

@@ -14,7 +14,7 @@ from daemonkit import served
 
 from drivelink.canopen.layout import Signal
 from drivelink.cli import main
-from drivelink.doctor.livevalues import LiveValues, Readings, Series
+from drivelink.doctor.livevalues import Series, values_of
 from drivelink.doctor.manualcheck import ByHand, Value, check_by_hand
 from drivelink.jointfile import JointFile, load, parse
 
@@ -97,7 +97,7 @@ def checked(
     wrong: Mapping[str, float], arrangement: str = "single", gear: float = 1.0, **replies: str
 ) -> ByHand:
     rig = HandMovedJoint(wrong, replies)
-    return check_by_hand(joint(arrangement, gear), rig, rig)
+    return check_by_hand(joint(arrangement, gear), rig.read, rig)
 
 
 def test_what_is_right_is_ticked_and_nothing_is_to_paste():
@@ -148,7 +148,7 @@ def test_each_fault_ends_in_the_line_that_cures_it(wrong, gear, lines):
 def test_a_torque_is_measured_against_a_known_push(wrong, push, reply, paste):
     rig = HandMovedJoint(wrong, {"Push": reply})
     rig.push = push
-    assert check_by_hand(joint(), rig, rig).paste == paste
+    assert check_by_hand(joint(), rig.read, rig).paste == paste
 
 
 def test_what_was_not_seen_is_not_ticked():
@@ -166,7 +166,7 @@ def test_of_two_motors_each_torque_has_its_own_gear_and_what_is_not_read_is_not_
     def pushed(wrong: dict[str, float], unread: str = "") -> ByHand:
         rig = HandMovedJoint(wrong, {"Push": "3.0"})
         rig.unread.add(unread)
-        return check_by_hand(joint("antagonistic"), rig, rig)
+        return check_by_hand(joint("antagonistic"), rig.read, rig)
 
     # The second motor's gear of 100 is not declared: its position reads 100 times as far, its torque a hundredth.
     done = pushed({"motor2_position": 100.0, "motor2_torque": 0.01})
@@ -240,28 +240,26 @@ def test_the_command_leads_through_the_steps_and_says_what_was_not_checked(bench
 
 
 def test_a_reading_is_as_uncertain_as_its_count_and_two_counts_are_no_reaction_to_a_push():
-    def collect(seconds: float) -> Readings:
-        return {(Signal.MOTOR_TORQUE, 0): Series([0.0, 0.1], [0.24, 0.24], [0.0, 0.0], step=0.12)}
-
-    read = LiveValues(collect).read(0.1)["motor1_torque"]
+    series = Series([0.0, 0.1], [0.24, 0.24], [0.0, 0.0], step=0.12)
+    read = values_of({(Signal.MOTOR_TORQUE, 0): series})["motor1_torque"]
     assert read.mean == 0.24 and read.std == pytest.approx(0.12 / math.sqrt(12.0))
     rig = HandMovedJoint({})
     rig.std, rig.push = read.std, 0.24
-    done = check_by_hand(joint(), rig, rig)
+    done = check_by_hand(joint(), rig.read, rig)
     (mark,) = (mark for mark in done.marks if mark.channel == "motor1_torque")
     assert mark.good is None and "no reaction" in mark.text and "motor1_torque" not in done.needed
 
 
 def test_a_linear_axis_is_moved_in_millimetres_and_pushed_in_newtons():
     rig = HandMovedJoint({})
-    done = check_by_hand(joint(axis="linear"), rig, rig)
+    done = check_by_hand(joint(axis="linear"), rig.read, rig)
     assert done.good and done.paste == []
     assert any("+51 mm (+0.051 m) for +50 mm (+0.05 m)" in line for line in rig.said)
     assert any("-1.5 N against the push" in line for line in rig.said)
     rig = HandMovedJoint({"link_position": 1e3}, {"Move": "0.051 m"})  # counts taken for millimetres
-    done = check_by_hand(joint(axis="linear"), rig, rig)
+    done = check_by_hand(joint(axis="linear"), rig.read, rig)
     assert done.paste == ["link.encoder.counts_per_rev = 6.5536e+07"]
     rig = HandMovedJoint({}, {"Move": "90 deg"})
     rig.ask = once(rig.ask, "Move", "51")  # type: ignore[method-assign]
-    assert check_by_hand(joint(axis="linear"), rig, rig).good
+    assert check_by_hand(joint(axis="linear"), rig.read, rig).good
     assert "expected an amount like 50 or 0.2 m, got 90 deg" in rig.said

@@ -21,11 +21,6 @@ class ForbiddenFrameError(Exception):
     """A frame that this program must never send: an internal error."""
 
 
-def _is_writable(index: int) -> bool:
-    """Return whether an object of a drive may be written: SYNC, heartbeat, TPDO communication and mapping."""
-    return index in _WRITABLE or 0x1800 <= index <= 0x1BFF
-
-
 def check_frame(cob_id: int, data: bytes) -> None:
     """Refuse frames that may not be sent.
 
@@ -41,7 +36,8 @@ def check_frame(cob_id: int, data: bytes) -> None:
         if command in (2, 3, 4):  # upload, upload segment, abort
             return
         index = data[1] | data[2] << 8
-        if command == 1 and data[0] & 0x02 and _is_writable(index):  # expedited download
+        communication = index in _WRITABLE or 0x1800 <= index <= 0x1BFF  # SYNC, heartbeat, TPDOs
+        if command == 1 and data[0] & 0x02 and communication:  # expedited download
             return
     raise ForbiddenFrameError(f"frame 0x{cob_id:03X} [{data.hex(' ')}] may not be sent to a drive")
 

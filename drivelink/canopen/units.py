@@ -85,7 +85,8 @@ class _Drive:
             MappedObject(signal=Signal.STATUSWORD, index=0x6041, subindex=0, bits=16, signed=False),
         )
         gear = self._gear()
-        counts = self._counts_per_rev()
+        reported, source = self._reported_counts()
+        counts = self._choose("counts per motor revolution", "counts_per_rev", reported, source)
         self._position(counts, gear)
         self._torque(gear)
         self._velocity(counts, gear)
@@ -93,9 +94,9 @@ class _Drive:
         self._second_encoder(counts, gear)
         self._polarity()
 
-    def _choose(
-        self, what: str, key: str, stated: float | None, reported: float | None, source: str
-    ) -> float | None:
+    def _choose(self, what: str, key: str, reported: float | None, source: str) -> float | None:
+        """Return the value of a key; None: neither the joint file nor the drive gives it."""
+        stated = getattr(self._drive, key) if key in self._drive.model_fields_set else None
         return _chosen(self._role, self._result, what, f"{self._role.key}: {key}", stated, reported, source)
 
     def _ratio(self, numerator: Address, denominator: Address) -> float | None:
@@ -113,7 +114,7 @@ class _Drive:
         reported, source = self._drive_gear()
         stated = self._drive.gear_ratio
         if "gear_ratio" not in self._drive.model_fields_set:
-            chosen = self._choose("gear ratio", "gear_ratio", None, reported, source)
+            chosen = self._choose("gear ratio", "gear_ratio", reported, source)
             if chosen is None and reported is not None:
                 text = f"no possible gear ratio in {source}, set {self._role.key}: gear_ratio"
                 self._result.missing[Signal.MOTOR_POSITION] = text
@@ -124,15 +125,8 @@ class _Drive:
                 f"gear ratio: the drive says 1 ({source}), the joint file {stated:.6g}; {stated:.6g} is used",
             )
             return stated
-        self._choose("gear ratio", "gear_ratio", stated, reported, source)
+        self._choose("gear ratio", "gear_ratio", reported, source)
         return stated
-
-    def _counts_per_rev(self) -> float | None:
-        """Counts of 0x6064 per motor revolution."""
-        reported, source = self._reported_counts()
-        return self._choose(
-            "counts per motor revolution", "counts_per_rev", self._drive.counts_per_rev, reported, source
-        )
 
     def _reported_counts(self) -> tuple[float | None, str]:
         angle = angle_unit_rad(self._reported.get((0x60A8, 0), 0))
@@ -169,13 +163,6 @@ class _Drive:
             _object(Signal.MOTOR_POSITION, (0x6064, 0), 32, scale, wraps=True),
         )
 
-    def _rated_torque(self) -> float | None:
-        raw = self._reported.get((0x6076, 0), 0)
-        reported = raw * self._rated_torque_unit(raw) if raw else None
-        return self._choose(
-            "rated torque in N·m", "rated_torque_nm", self._drive.rated_torque_nm, reported, "0x6076"
-        )
-
     def _rated_torque_unit(self, raw: int) -> float:
         """N·m per count of 0x6076: 1e-3 by CiA 402, 1e-6 with some."""
         if not self._vendor.rated_torque_micro:
@@ -188,13 +175,6 @@ class _Drive:
             return 1e-6 if raw >= _MICRO_FROM else 1e-3
         return min((1e-3, 1e-6), key=lambda unit: abs(math.log(raw * unit / evidence)))
 
-    def _rated_current(self) -> float | None:
-        raw = self._reported.get((0x6075, 0), 0)
-        reported = raw * 1e-3 if raw else None
-        return self._choose(
-            "rated current in A", "rated_current_a", self._drive.rated_current_a, reported, "0x6075"
-        )
-
     def _torque_constant(self, rated_torque: float | None, rated_current: float | None) -> float | None:
         reported, source = None, ""
         if self._vendor.torque_constant and self._reported.get(self._vendor.torque_constant):
@@ -203,8 +183,7 @@ class _Drive:
                 self._reported[self._vendor.torque_constant] * 1e-6,
                 f"0x{index:04X}:{subindex:02X}",
             )
-        stated = self._drive.torque_constant_nm_a
-        chosen = self._choose("torque constant in N·m/A", "torque_constant_nm_a", stated, reported, source)
+        chosen = self._choose("torque constant in N·m/A", "torque_constant_nm_a", reported, source)
         if chosen is None and rated_torque and rated_current:
             return rated_torque / rated_current
         return chosen
@@ -212,7 +191,11 @@ class _Drive:
     def _torque(self, gear: float) -> None:
         drive = self._drive
         direction = drive.torque_direction or drive.direction
-        rated_torque, rated_current = self._rated_torque(), self._rated_current()
+        raw = self._reported.get((0x6076, 0), 0)
+        reported = raw * self._rated_torque_unit(raw) if raw else None
+        rated_torque = self._choose("rated torque in N·m", "rated_torque_nm", reported, "0x6076")
+        reported = self._reported.get((0x6075, 0), 0) * 1e-3 or None
+        rated_current = self._choose("rated current in A", "rated_current_a", reported, "0x6075")
         constant = self._torque_constant(rated_torque, rated_current)
         if rated_torque is None and constant is not None and rated_current is not None:
             rated_torque = constant * rated_current  # Nanotec: no 0x6076, the torque of the rated current
@@ -263,9 +246,7 @@ class _Drive:
         stated = self._drive.velocity_rad_s_per_count
         asked = self._drive.velocity or "velocity" in self._drive.checks
         if asked:
-            chosen = self._choose(
-                "velocity unit in rad/s", "velocity_rad_s_per_count", stated, reported, source
-            )
+            chosen = self._choose("velocity unit in rad/s", "velocity_rad_s_per_count", reported, source)
         else:
             chosen = reported if stated is None else stated
         signal = Signal.MOTOR_VELOCITY if self._drive.velocity else Signal.VELOCITY_CHECK

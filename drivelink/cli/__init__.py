@@ -23,7 +23,7 @@ from difflib import get_close_matches
 from itertools import groupby
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from drivelink.errors import DrivelinkError, JointFileError, UsageError
 from drivelink.plaintext import PlainFormatter, clean_text, spell_out
@@ -101,20 +101,6 @@ class _Help(argparse.HelpFormatter):
         return "\n".join(lines)
 
 
-class Verb(Protocol):
-    """Interface of a verb's module."""
-
-    EPILOG: str
-
-    @staticmethod
-    def configure(parser: argparse.ArgumentParser) -> None:
-        """Add the verb's arguments."""
-
-    @staticmethod
-    def run(args: argparse.Namespace) -> int:
-        """Run the verb; return the exit status."""
-
-
 def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
     """Return the parser; only the modules of the given verbs are imported and configured."""
     parser = argparse.ArgumentParser(
@@ -130,10 +116,10 @@ def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
             name, help=summary, description=summary[0].upper() + summary[1:] + ".", formatter_class=_Help
         )
         if name in verbs:
-            module: Verb = importlib.import_module(f"drivelink.cli.{name}")  # type: ignore[assignment]
+            module: Any = importlib.import_module(f"drivelink.cli.{name}")
             subparser.epilog = module.EPILOG
             module.configure(subparser)
-            subparser.set_defaults(run=module.run)
+            subparser.set_defaults(run=module.run, parser=subparser)
     return parser
 
 
@@ -164,7 +150,7 @@ def _main(argv: list[str] | None) -> int:
         parser = make_parser([verb])
         args, unknown = parser.parse_known_args(argv)
         if unknown:  # argparse itself would show the usage of the whole program
-            _verb_parser(parser, verb).error(f"unrecognized arguments: {' '.join(unknown)}")
+            getattr(args, "parser", parser).error(f"unrecognized arguments: {' '.join(unknown)}")
         return int(args.run(args))
     except DrivelinkError as error:
         return _fail(verb, f"{error}{_instead_of_a_name(error)}", error.exit_status)
@@ -176,14 +162,6 @@ def _main(argv: list[str] | None) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _fail(verb, f"{where}{error.strerror or error}", 1)
-
-
-def _verb_parser(parser: argparse.ArgumentParser, verb: str) -> argparse.ArgumentParser:
-    """Return the parser of one verb."""
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction) and verb in action.choices:
-            return action.choices[verb]  # type: ignore[no-any-return]
-    return parser
 
 
 def add_map(parser: argparse.ArgumentParser) -> None:

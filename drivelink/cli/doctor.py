@@ -79,8 +79,8 @@ def _by_hand(joint: JointFile | None, args: argparse.Namespace, seconds: float) 
     """Guide through the checks; return 1 if a sign or scale is wrong or nothing was checked."""
     if joint is None:
         raise UsageError("--move: expected a joint file")
-    with live_values(joint, args.joint.parent) as values:
-        done = check_by_hand(joint, values, _Terminal(sys.stderr if args.json else sys.stdout), seconds)
+    with live_values(joint, args.joint.parent) as read:
+        done = check_by_hand(joint, read, _Terminal(sys.stderr if args.json else sys.stdout), seconds)
     if args.json:
         print(json.dumps(done.as_dict()))
         return 0 if done.good else 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
 
 from drivelink._core import Assembler, JointPipeline
 from drivelink.canopen.layout import NodeLayout
@@ -12,23 +11,14 @@ from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from estimator import Estimator, make_estimator
-from estimator.sample import Estimate, Sample
+from estimator.model_monitor import ModelMonitor
+from estimator.sample import Sample
 
 _REHEARSED = 500  # samples: half a second, enough for the first estimates
 _HOLD_S, _HOLD_PERIODS = 0.25, 10  # of silence, and at least so many, see `Assembler`
 
 
-class ResidualMonitor(Protocol):
-    """Interface of the model monitor."""
-
-    def step(self, sample: Sample, estimate: Estimate, residual_nm: float) -> bool:
-        """Process a sample; return whether the alarm is on."""
-
-    def describe(self) -> dict[str, Any]:
-        """Return the residual against its baseline and likely location, for the status key."""
-
-
-Built = tuple[Estimator, ResidualMonitor | None]
+Built = tuple[Estimator, ModelMonitor | None]
 
 
 def build(joint: JointFile) -> Built:

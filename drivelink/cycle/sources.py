@@ -136,7 +136,7 @@ class BusSource(FrameSource):
                 can.Message(timestamp=time.time(), arbitration_id=cob_id, data=data, is_extended_id=False)
             )
         except can.CanError as error:
-            if not _is_full(error):
+            if error.error_code != errno.ENOBUFS and "buffer full" not in str(error).lower():
                 raise BusLostError(str(error)) from error
             self.lost_sends += 1
         except OSError as error:
@@ -156,10 +156,6 @@ class BusSource(FrameSource):
             return self._bus.recv(timeout_s)
         except Exception as error:  # python-can's interfaces raise various exceptions
             raise BusLostError(str(error) or type(error).__name__) from error
-
-
-def _is_full(error: can.CanError) -> bool:
-    return getattr(error, "error_code", None) == errno.ENOBUFS or "buffer full" in str(error).lower()
 
 
 class VirtualSource(BusSource):

@@ -12,8 +12,8 @@ from drivelink.canopen.emcy import drive_state, nmt_state
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.loop import LoopJoint
 from drivelink.cycle.objectcheck import contradicted
-from drivelink.cycle.pipeline import ResidualMonitor
 from drivelink.daemon.status import EventLog
+from estimator.model_monitor import ModelMonitor
 from estimator.sample import Status
 
 _WORDS = {
@@ -134,7 +134,7 @@ class JointWatch:
             self._events.begin(key, f"{loop_joint.name}: no valid estimates; suspected: {suspicion['text']}")
 
 
-def residual_text(monitor: ResidualMonitor | None) -> str:
+def residual_text(monitor: ModelMonitor | None) -> str:
     """Return the residual against its baseline in words, if known."""
     location = monitor.describe().get("location") if monitor is not None else None
     ratio = residual_ratio(monitor)
@@ -142,7 +142,7 @@ def residual_text(monitor: ResidualMonitor | None) -> str:
     return "" if ratio is None else f": the residual is {ratio:.2g} times its baseline{where}"
 
 
-def residual_ratio(monitor: ResidualMonitor | None) -> float | None:
+def residual_ratio(monitor: ModelMonitor | None) -> float | None:
     """Return the largest residual over its baseline, if known."""
     described = monitor.describe() if monitor is not None else {}
     residuals, baselines = described.get("residual_nm") or (), described.get("floor_nm") or ()

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import can
@@ -22,7 +21,7 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.scan import listen
 from drivelink.canopen.sdo import Program, Read, SdoAbort
 from drivelink.doctor.machine import daemon_mapping
-from drivelink.doctor.manualcheck import Value
+from drivelink.doctor.manualcheck import Reader, Value
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import LoggedFrame
@@ -230,34 +229,20 @@ def _known(grid: FloatArray, channels: Sequence[FloatArray], most_s: float) -> N
     return max(parts, key=len)
 
 
-class LiveValues:
-    """The channels' values, for the checks by hand.
-
-    Args:
-        collect: readings of the next so many seconds.
-    """
-
-    def __init__(self, collect: Callable[[float], Readings]) -> None:
-        self._collect = collect
-
-    def read(self, seconds: float) -> Mapping[str, Value]:
-        """Return mean and standard deviation over the next seconds: "motor1_position", …, "link_position".
-
-        Raises:
-            DriveError: a node does not answer.
-        """
-        found = {}
-        for (signal, motor), series in self._collect(seconds).items():
-            name = "link_position" if motor is None else f"motor{motor + 1}_{_NAMES.get(signal, '')}"
-            if motor is None or signal in _NAMES:
-                std = math.hypot(float(np.std(series.values)), series.step / math.sqrt(12.0))
-                found[name] = Value(float(np.mean(series.values)), std)
-        return found
+def values_of(readings: Readings) -> Mapping[str, Value]:
+    """Return mean and standard deviation of "motor1_position", …, "link_position", for the checks by hand."""
+    found = {}
+    for (signal, motor), series in readings.items():
+        name = "link_position" if motor is None else f"motor{motor + 1}_{_NAMES.get(signal, '')}"
+        if motor is None or signal in _NAMES:
+            std = math.hypot(float(np.std(series.values)), series.step / math.sqrt(12.0))
+            found[name] = Value(float(np.mean(series.values)), std)
+    return found
 
 
 @contextmanager
-def live_values(joint: JointFile, base_dir: Path) -> Iterator[LiveValues]:
-    """Return the channels of a joint on its bus.
+def live_values(joint: JointFile, base_dir: Path) -> Iterator[Reader]:
+    """Yield what reads the channels of a joint on its bus.
 
     Raises:
         BusError: the bus cannot be opened.
@@ -267,7 +252,7 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[LiveValues]:
     try:
         if joint.bus.configure:
             asked = Asked([run_program(survey_node(role), bus, joint.bus) for role in roles(joint, base_dir)])
-            yield LiveValues(lambda seconds: run_program(asked.program(seconds), bus, joint.bus))
+            yield lambda seconds: values_of(run_program(asked.program(seconds), bus, joint.bus))
         else:
             silent = SilentBus(bus)
             known = PassiveConfigurator([joint], [base_dir])
@@ -275,6 +260,6 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[LiveValues]:
             heard = Heard(joint, known)
             if not heard.listen(silent, _PATIENCE_S):
                 raise DriveError(f"{joint.name}: no sample in {_PATIENCE_S:g} s: {heard.missing}")
-            yield LiveValues(partial(heard.listen, silent))
+            yield lambda seconds: values_of(heard.listen(silent, seconds))
     finally:
         bus.shutdown()

@@ -1,4 +1,4 @@
-"""Checks this machine (scheduling, memory, CPU clock, timer), its CAN interface, SYNC on its bus, and zenoh."""
+"""Checks this machine (scheduling, memory, CPU clock, timer), its CAN interface, SYNC on its bus, zenoh."""
 
 from __future__ import annotations
 

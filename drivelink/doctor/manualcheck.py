@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 from drivelink.jointfile import JointFile
@@ -74,11 +75,7 @@ class Value(NamedTuple):
     std: float
 
 
-class Values(Protocol):
-    """Source of the channels' values."""
-
-    def read(self, seconds: float) -> Mapping[str, Value]:
-        """Return the values over the next seconds: "motor1_position", "motor1_torque", …, "link_position"."""
+Reader = Callable[[float], Mapping[str, Value]]
 
 
 class Person(Protocol):
@@ -102,7 +99,7 @@ class Mark:
 
     def __str__(self) -> str:
         sign = {True: "✓", False: "✗", None: "·"}[self.good]
-        return f"{sign} {_words(self.channel)}, {self.what}: {self.text}"
+        return f"{sign} {self.channel.replace('_', ' ').replace('motor', 'motor ')}, {self.what}: {self.text}"
 
 
 @dataclass(slots=True)
@@ -129,16 +126,17 @@ class ByHand:
         }
 
 
-def check_by_hand(joint: JointFile, values: Values, person: Person, seconds: float = 0.3) -> ByHand:
+def check_by_hand(joint: JointFile, read: Reader, person: Person, seconds: float = 0.3) -> ByHand:
     """Guide a person through the checks.
 
     Args:
+        read: returns the channels over the next so many seconds: "motor1_position", …, "link_position".
         seconds: over which a channel at rest is averaged.
 
     Raises:
         UsageError: nobody answers.
     """
-    steps = _Steps(joint, values, person, seconds)
+    steps = _Steps(joint, read, person, seconds)
     person.show("drivelink moves nothing: you do, by hand or with whatever controls the drive.")
     serial = joint.arrangement == "serial"
     together = [f"motor{i + 1}_position" for i in range(1 if serial else len(joint.motor))]
@@ -157,8 +155,9 @@ def check_by_hand(joint: JointFile, values: Values, person: Person, seconds: flo
 class _Steps:
     """The checks in order."""
 
-    def __init__(self, joint: JointFile, values: Values, person: Person, seconds: float) -> None:
-        self._joint, self._values, self._person, self._seconds = joint, values, person, seconds
+    def __init__(self, joint: JointFile, read: Reader, person: Person, seconds: float) -> None:
+        self._joint, self._read, self._person = joint, read, person
+        self._now = partial(read, seconds)  # the channels at rest
         self._axis = _LINEAR if joint.axis == "linear" else _ROTARY
         self.done = ByHand()  # results so far
 
@@ -186,7 +185,7 @@ class _Steps:
     def _position(self, channel: str, moved: float, asked: float) -> None:
         shown = self._axis.shown
         seen, ratio = f"{shown(moved)} for {shown(asked)}", abs(moved / asked)
-        geared = channel != "link_position" and (self._is_gear(ratio) or self._gear_twice(ratio, channel))
+        geared = channel != "link_position" and self._is_gear(ratio, int(channel[5]) - 1)
         if ratio < _STILL and not geared:
             self._mark(channel, "sign", None, f"did not follow ({seen}): jog it, or check its cable")
             return
@@ -201,15 +200,12 @@ class _Steps:
         if not good and geared:  # a gear is in the torque as well
             self.done.needed[channel.replace("position", "torque")] = ratio
 
-    def _is_gear(self, ratio: float) -> bool:
-        """Return whether a scale is wrong by an undeclared gear rather than a unit."""
-        return ratio > _GEARED and abs(math.log(ratio * self._axis.everyday)) > _BY_EYE
-
-    def _gear_twice(self, ratio: float, channel: str) -> bool:
-        """Return whether a motor's motion is too small by its declared gear."""
-        drive = self._joint.motor[int(channel[5]) - 1].drive
-        gear = 1.0 if drive is None else drive.gear_ratio
-        return gear > _GEARED and abs(ratio * gear - 1.0) < _BY_EYE
+    def _is_gear(self, ratio: float, motor: int) -> bool:
+        """Return whether a scale is wrong by a gear that is not declared (no unit is so large), or twice."""
+        drive = self._joint.motor[motor].drive
+        declared = 1.0 if drive is None else drive.gear_ratio
+        undeclared = ratio > _GEARED and abs(math.log(ratio * self._axis.everyday)) > _BY_EYE
+        return undeclared or (declared > _GEARED and abs(ratio * declared - 1.0) < _BY_EYE)
 
     def torques(self, channels: Sequence[str]) -> None:
         """Check torques of drives that hold their position against a push."""
@@ -254,33 +250,23 @@ class _Steps:
 
     def _torque_scale(self, held: Mapping[str, float], pushed: float, unread: bool) -> None:
         """Compare the motors' total torque with a known torque."""
-        total = sum(held.values())
+        total, unit, several = sum(held.values()), self._axis.force, len(held) > 1
         ratio = total / pushed
-        text = f"{total:.3g} {self._axis.force} for {pushed:.3g} {self._axis.force}"
-        good = 1.0 / _FRICTION <= ratio <= _FRICTION
+        good = None if unread else 1.0 / _FRICTION <= ratio <= _FRICTION
+        text = f"{total:.3g} {unit} for {pushed:.3g} {unit}"
         if unread:
-            good_or_not, text = None, f"{text}, without the motor that was not read"
-        elif good:
-            good_or_not = True
-        elif len(held) == 1:
-            good_or_not, text = False, f"{text}: {ratio:.4g} times as much"
-        else:
-            good_or_not, text = (
-                False,
-                f"{text} together: {ratio:.4g} times as much, in one of them or in both",
-            )
+            text += ", without the motor that was not read"
+        elif not good:
+            which = ", in one of them or in both" if several else ""
+            text += f"{' together' if several else ''}: {ratio:.4g} times as much{which}"
         for channel in held:
-            self._mark(channel, "scale", good_or_not, text)
-            if good_or_not is False and len(held) == 1:
+            self._mark(channel, "scale", good, text)
+            if good is False and not several:
                 self.done.needed[channel] = self.done.needed.get(channel, 1.0) / ratio
 
     def _ask(self, text: str) -> str:
         """Ask; channels are read meanwhile to follow counters that roll over."""
-        return self._person.ask(text, lambda: self._values.read(0.05)).strip()
-
-    def _now(self) -> Mapping[str, Value]:
-        """Read the channels at rest."""
-        return self._values.read(self._seconds)
+        return self._person.ask(text, lambda: self._read(0.05)).strip()
 
     def _mark(self, channel: str, what: str, good: bool | None, text: str) -> None:
         mark = Mark(channel=channel, what=what, good=good, text=text)
@@ -319,7 +305,3 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
-
-
-def _words(channel: str) -> str:
-    return channel.replace("_", " ").replace("motor", "motor ")

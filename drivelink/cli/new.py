@@ -8,8 +8,9 @@ import re
 import shutil
 import sys
 import sysconfig
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Container
+from dataclasses import fields, replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -51,43 +52,35 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="KIND",
         help=f"how the motors act on the joint: {', '.join(_ARRANGEMENTS)}",
     )
-    add_number(
-        parser, "--rotor-inertia", metavar="G_CM2", help="rotor inertia of each motor, g·cm² (data sheet)"
-    )
-    add_number(parser, "--inertia", metavar="KG_M2", help="instead: inertia of each motor, joint side")
-    add_number(
-        parser,
-        "--torque-constant",
-        metavar="MNM_A",
-        help="torque constant of each motor, mN·m/A, if the drive reports no torque",
-    )
-    add_number(parser, "--damping", least=0.0, metavar="NM_S_RAD", help="damping of each motor, joint side")
+    number = partial(add_number, parser)
+    about = "rotor inertia of each motor, g·cm² (data sheet)"
+    number("--rotor-inertia", dest="rotor_inertia_gcm2", metavar="G_CM2", help=about)
+    about = "instead: inertia of each motor, joint side"
+    number("--inertia", dest="inertia_kg_m2", metavar="KG_M2", help=about)
+    about = "torque constant of each motor, mN·m/A, if the drive reports no torque"
+    number("--torque-constant", dest="torque_constant_mnm_a", metavar="MNM_A", help=about)
+    about = "damping of each motor, joint side"
+    number("--damping", least=0.0, dest="viscous_damping_nm_s_rad", metavar="NM_S_RAD", help=about)
     parser.add_argument(
         "--model", choices=_MODELS, metavar="MODEL", help=f"model of the transmission: {', '.join(_MODELS)}"
     )
-    add_number(
-        parser,
-        "--node",
-        least=1,
-        most=127,
-        whole=True,
-        action="append",
-        metavar="ID",
-        help="node ID of a drive; twice for a VSA",
-    )
-    add_number(parser, "--gear", metavar="RATIO", help="motor revolutions per joint revolution")
-    parser.add_argument("--encoder", metavar="drive|none|ID", help="link encoder: ID of a CiA 406 node")
+    about = "node ID of a drive; twice for a VSA"
+    number("--node", least=1, most=127, whole=True, dest="nodes", action="append", metavar="ID", help=about)
+    number("--gear", dest="gear_ratio", metavar="RATIO", help="motor revolutions per joint revolution")
+    about = "link encoder: ID of a CiA 406 node"
+    parser.add_argument("--encoder", metavar="drive|none|ID", help=about)
     parser.add_argument("--interface", help="python-can interface (default: socketcan)")
     parser.add_argument("--channel", help="python-can channel (default: can0)")
-    add_number(parser, "--bitrate", whole=True, help="bit/s (default: 1000000)")
-    parser.add_argument("--passive", action="store_true", help="another master controls the bus")
+    number("--bitrate", whole=True, help="bit/s (default: 1000000)")
+    about = "another master controls the bus"
+    parser.add_argument("--passive", action="store_true", default=None, help=about)
     parser.add_argument("--force", action="store_true", help="replace PATH if it exists")
     parser.add_argument("--json", action="store_true", help="print what was made as one JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
     """Ask for missing answers in a terminal, and write the file."""
-    if args.inertia is not None and args.rotor_inertia is not None:
+    if args.inertia_kg_m2 is not None and args.rotor_inertia_gcm2 is not None:
         raise UsageError("expected either --inertia or --rotor-inertia")
     if args.examples is not None:
         print(f"{_examples(args.examples)} written")
@@ -153,20 +146,16 @@ def _case_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
 
 
 def _new_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
-    given = {key: getattr(args, option) for key, option, _ in _QUESTIONS} | {
-        "inertia_kg_m2": args.inertia,
-        "nodes": args.node,
-        "encoder": _encoder(args.encoder),
-        "bitrate": args.bitrate,
-        "passive": args.passive or None,
-    }
-    answers = Answers(**{key: value for key, value in given.items() if value is not None})
-    if args.path is not None and args.name is None and args.path.stem and str(args.path) != "-":
-        answers.name = given["name"] = args.path.stem
+    options = {one.name: getattr(args, one.name, None) for one in fields(Answers)}
+    given = {name: value for name, value in options.items() if value is not None}
+    if args.path is not None and args.path.stem and str(args.path) != "-":
+        given.setdefault("name", args.path.stem)
+    _encoder(given.get("encoder", "drive"))
+    answers = Answers(**given)
     if args.scan:
         answers = _scanned(answers)
     elif sys.stdin.isatty() and str(args.path) != "-" and not args.json:
-        _ask(answers, {key for key, value in given.items() if value is not None})
+        _ask(answers, given)
     _require_possible(answers)
     if answers.rotor_inertia_gcm2 is not None and answers.gear_ratio is None:
         raise UsageError(
@@ -188,10 +177,8 @@ def _require_possible(answers: Answers) -> None:
         raise UsageError(f"--encoder none: expected --model none, as {answers.model} needs a link encoder")
 
 
-def _encoder(text: str | None) -> str | None:
-    if text is None or text in ("drive", "none"):
-        return text
-    if text.isdecimal() and 1 <= int(text) <= 127:
+def _encoder(text: str) -> str:
+    if text in ("drive", "none") or (text.isdecimal() and 1 <= int(text) <= 127):
         return text
     raise UsageError(f'--encoder: expected "drive", "none" or a node id from 1 to 127, got "{text}"')
 
@@ -209,41 +196,37 @@ def _scanned(answers: Answers) -> Answers:
     return answers_from_bus(answers, found)
 
 
-# Keys of `Answers`, with the option that answers and the question.
-_QUESTIONS = (
-    ("name", "name", "Name of the joint"),
-    ("arrangement", "arrangement", f"Arrangement of the motors: {', '.join(_ARRANGEMENTS)}"),
-    ("gear_ratio", "gear", "Gear ratio: motor revolutions per joint revolution, 1 for a direct drive"),
-    ("rotor_inertia_gcm2", "rotor_inertia", "Rotor inertia of the motor, g·cm² (its data sheet)"),
-    (
-        "torque_constant_mnm_a",
-        "torque_constant",
+_QUESTIONS = {  # by the key of `Answers`
+    "name": "Name of the joint",
+    "arrangement": f"Arrangement of the motors: {', '.join(_ARRANGEMENTS)}",
+    "gear_ratio": "Gear ratio: motor revolutions per joint revolution, 1 for a direct drive",
+    "rotor_inertia_gcm2": "Rotor inertia of the motor, g·cm² (its data sheet)",
+    "torque_constant_mnm_a":
         "Torque constant of the motor, mN·m/A (its data sheet; Enter: the drive reports its torque)",
-    ),
-    ("viscous_damping_nm_s_rad", "damping", "Motor damping at the joint side, N·m·s/rad (0: not known)"),
-    ("model", "model", f"Transmission: {', '.join(_MODELS)}"),
-    ("interface", "interface", "CAN interface (python-can)"),
-    ("channel", "channel", "Channel"),
-)
+    "viscous_damping_nm_s_rad": "Motor damping at the joint side, N·m·s/rad (0: not known)",
+    "model": f"Transmission: {', '.join(_MODELS)}",
+    "interface": "CAN interface (python-can)",
+    "channel": "Channel",
+    "nodes": "Node id of the drive of motor",
+    "encoder": "Link encoder: drive, none, or node id of a CiA 406 encoder",
+}  # fmt: skip
 
 
-def _ask(answers: Answers, known: set[str]) -> None:
+def _ask(answers: Answers, known: Container[str]) -> None:
     """Ask for each missing answer; Enter keeps the default."""
     try:
-        for key, option, question in _QUESTIONS:
+        for key, question in _QUESTIONS.items():
             if key in known or (key == "rotor_inertia_gcm2" and "inertia_kg_m2" in known):
                 continue
+            if key == "nodes":
+                motors = range(1, answers.motors + 1)
+                answers.nodes = [_asked(f"{question} {motor}", motor, _check(key)) for motor in motors]
+                continue
             needed = key in ("gear_ratio", "rotor_inertia_gcm2")  # no drive reports them
-            check = _fitting(answers, key, _check(option))
+            check = _fitting(answers, key, _encoder if key == "encoder" else _check(key))
             setattr(answers, key, _asked(question, getattr(answers, key), check, needed=needed))
             if key == "rotor_inertia_gcm2":
                 print(f"  at the joint: {answers.conversion}")
-        if "nodes" not in known:
-            for motor in range(1, answers.motors + 1):
-                answers.nodes.append(_asked(f"Node id of the drive of motor {motor}", motor, _check("node")))
-        if "encoder" not in known:
-            question = "Link encoder: drive, none, or node id of a CiA 406 encoder"
-            answers.encoder = _asked(question, answers.encoder, _fitting(answers, "encoder", _encoder))
     except EOFError:
         raise UsageError("the questions were not answered; options answer them, too: --help") from None
 

@@ -261,7 +261,7 @@ def joint_text(drive: str = "", link: str = "", bus: str = "") -> str:
 
 
 def configure(bus, joint, base_dir=Path(), *, idle=None):
-    return configure_joints(bus, [joint], [base_dir], idle=idle)[1][0]
+    return tuple(configure_joints(bus, [joint], [base_dir], idle=idle).layouts.values())
 
 
 def configured(slave: Slave, text: str = "", **sections: str) -> tuple[Wire, NodeLayout]:

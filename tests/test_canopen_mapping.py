@@ -232,8 +232,8 @@ def test_unneeded_frames_are_switched_off_where_the_load_demands_it():
     slaves, joints = several(5, 6, 7, 8)
     for slave in slaves:
         slave.objects[0x1801, 1].value = NO_RTR | 0x280 + slave.node
-    configurator, layouts = configure_joints(Wire(slaves), joints)
-    assert all(not layout.other_tpdos for mine in layouts for layout in mine)
+    configurator = configure_joints(Wire(slaves), joints)
+    assert all(not layout.other_tpdos for layout in configurator.layouts.values())
     assert all(slave.objects[0x1801, 1].value & INVALID for slave in slaves)
     # SYNC 55 + 4 frames of 135 bits at 1 kHz, four heartbeats of 65 bits at 10 Hz
     assert configurator.load().bits_per_s == pytest.approx(1000 * (55 + 4 * 135) + 4 * 10 * 65)

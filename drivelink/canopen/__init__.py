@@ -2,7 +2,7 @@
 
 Before the start (blocking)::
 
-    configurator, layouts = configure_joints(bus, [joint], [folder])
+    configurator = configure_joints(bus, [joint], [folder])
 
 In the run the loop alone reads the bus. It calls `configurator.start(node)` after a boot-up message,
 `configurator.feed(cob_id, data, now_s)` for every frame 0x581 to 0x5FF, and regularly

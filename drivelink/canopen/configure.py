@@ -20,7 +20,6 @@ from drivelink.canopen.layout import (
     NodeLayout,
     bus_load,
     check_capacity,
-    roles,
     roles_by_node,
 )
 from drivelink.canopen.mapping import NMT_START
@@ -136,7 +135,7 @@ def configure_joints(
     base_dirs: Sequence[Path] | None = None,
     *,
     idle: Idle | None = None,
-) -> tuple[Configurator, tuple[tuple[NodeLayout, ...], ...]]:
+) -> Configurator:
     """Configure and start all nodes of all joints on one bus, and check the bus load.
 
     Args:
@@ -144,34 +143,13 @@ def configure_joints(
         idle: called between receptions, e.g. the simulated devices' `poll` in lockstep.
 
     Returns:
-        The configurator (for reboots in the run), and the layouts joint by joint.
+        The configurator, which knows the layouts, for reboots in the run.
 
     Raises:
         DriveError: a node is absent, refuses, or cannot give what is needed.
-        BusError: the bus fails, is too slow, or another master makes SYNC.
+        BusError: the bus fails, or is too slow.
     """
     section = joints[0].bus
-    if section.sync == "produce":
-        refuse_foreign_sync(bus, section, idle)
-    configurator = _actively(bus, joints, base_dirs, idle)
-    load = configurator.load()
-    check_capacity(load, section.period_s)
-    for layout in configurator.layouts.values():
-        log_notices(logger, layout.notices)
-    logger.info("bus load %.0f %% of %d kbit/s", 100 * load.fraction, section.bitrate // 1000)
-    send = sender(bus)
-    for node in configurator.nodes:
-        send(0, bytes([NMT_START, node]))
-    result = []
-    for joint in joints:
-        mine = {role.node_id for role in roles(joint)}
-        result.append(tuple(layout for node, layout in configurator.layouts.items() if node in mine))
-    return configurator, tuple(result)
-
-
-def _actively(
-    bus: FrameBus, joints: Sequence[JointFile], base_dirs: Sequence[Path] | None, idle: Idle | None
-) -> Configurator:
     configurator = Configurator(sender(bus), joints, base_dirs)
     for node in configurator.nodes:
         _configure_one(configurator, node, bus, idle)
@@ -180,6 +158,14 @@ def _actively(
         for node in configurator.nodes:
             if configurator.layouts[node].other_tpdos:
                 _configure_one(configurator, node, bus, idle)
+    load = configurator.load()
+    check_capacity(load, section.period_s)
+    for layout in configurator.layouts.values():
+        log_notices(logger, layout.notices)
+    logger.info("bus load %.0f %% of %d kbit/s", 100 * load.fraction, section.bitrate // 1000)
+    send = sender(bus)
+    for node in configurator.nodes:
+        send(0, bytes([NMT_START, node]))
     return configurator
 
 

@@ -15,7 +15,7 @@ from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.bus import Idle, frames, is_canopen, received_ns
 from drivelink.canopen.configure import Configurator, configure_joints, refuse_foreign_sync
 from drivelink.canopen.emcy import nmt_state
-from drivelink.canopen.layout import NodeLayout, roles
+from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.loop import CycleLoop
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
@@ -42,8 +42,6 @@ class BusPort:
         return self.bus.recv(timeout)
 
 
-Joined = tuple[Configurator | PassiveConfigurator, tuple[tuple[NodeLayout, ...], ...]]
-
 logger = logging.getLogger(__name__)
 
 _PATIENCE_S = 5.0  # after which it is said what another master is waited for
@@ -56,8 +54,8 @@ def join_bus(
     *,
     idle: Idle | None = None,
     patience_s: float = _PATIENCE_S,
-) -> Joined:
-    """Get the layouts of all nodes, by configuring them or by listening.
+) -> Configurator | PassiveConfigurator:
+    """Get the layouts of all nodes, by configuring them or by listening; return what knows them.
 
     Another master, for its SYNC or its configuration of the nodes, is waited for without end; after
     `patience_s` one line says so. The period of its SYNC is measured and returned in the configurator's
@@ -67,25 +65,18 @@ def join_bus(
         BusError: SYNC is unexpected, or the bus fails.
         DriveError: a node is absent, refuses, or its frames are shorter than the joint file says.
     """
-    section = joints[0].bus
-    if section.configure:
-        configurator, layouts = configure_joints(port, joints, folders, idle=idle)
-        if section.sync == "follow":
-            stamps = _await(port, _Expected(section.channel, ()), idle, patience_s)
-            configurator.bus = _timed(section, stamps)
-        return configurator, layouts
-    passive = PassiveConfigurator(joints, folders)
+    section, passive = joints[0].bus, None
     if section.sync == "produce":
         refuse_foreign_sync(port, section, idle)
-    _listen(port, passive, idle, patience_s)
+    if section.configure:
+        configurator: Configurator | PassiveConfigurator = configure_joints(port, joints, folders, idle=idle)
+    else:
+        configurator = passive = PassiveConfigurator(joints, folders)
+        _listen(port, passive, idle, patience_s)
     if section.sync == "follow":
-        expected = _Expected(section.channel, passive.layouts.values())
-        passive.bus = _timed(section, _await(port, expected, idle, patience_s, passive))
-    by_joint = tuple(
-        tuple(passive.layouts[role.node_id] for role in roles(joint, folder))
-        for joint, folder in zip(joints, folders, strict=True)
-    )
-    return passive, by_joint
+        expected = _Expected(section.channel, passive.layouts.values() if passive is not None else ())
+        configurator.bus = _timed(section, _await(port, expected, idle, patience_s, passive))
+    return configurator
 
 
 def _timed(section: BusSection, stamps_ns: Sequence[int]) -> BusSection:

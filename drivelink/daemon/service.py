@@ -25,7 +25,7 @@ from drivelink.canopen.layout import NodeLayout, roles
 from drivelink.cycle import realtime
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.objectcheck import HISTORY_S
-from drivelink.cycle.pipeline import build, make_pipeline, rehearse
+from drivelink.cycle.pipeline import Built, build, make_pipeline, rehearse
 from drivelink.cycle.sources import open_source
 from drivelink.cycle.startup import BusPort, join_bus
 from drivelink.daemon.buswatch import BusKeeper
@@ -104,34 +104,91 @@ class Daemon:
             self._port = BusPort(open_bus(self._section))
             self._keeper = BusKeeper(self._port, self._section, self.events, devices)
             self._closing.callback(self._keeper.close)
-            self._configurator, layouts = join_bus(
-                self._port, [s.joint for s in joints], [s.folder for s in joints], idle=devices
-            )
-            self._assemble(layouts)
+            files, folders = [s.joint for s in joints], [s.folder for s in joints]
+            self._configurator = join_bus(self._port, files, folders, idle=devices)
+            self._assemble()
         except BaseException:
             self._closing.close()
             raise
 
-    def _assemble(self, layouts: Sequence[tuple[NodeLayout, ...]]) -> None:
+    def _assemble(self) -> None:
         """Make everything that knows the period of SYNC: pipelines, loop, and what is beside it."""
-        self._section = self._configurator.bus  # with the measured period of another master's SYNC
-        keep = round(HISTORY_S / self._section.period_s)
-        self._loop_joints = [
-            LoopJoint(served.joint.name, make_pipeline(self._timed(served.joint), mine, keep=keep), publisher)
-            for served, mine, publisher in zip(self._joints, layouts, self._publishers, strict=True)
-        ]
-        self.loop = self._make_loop()
-        self._supervisor = Supervisor(
-            self.loop, dict(zip(self._loop_joints, layouts, strict=True)), self.events, self._configurator
+        section = self._section = self._configurator.bus  # with the measured period of another master's SYNC
+        keep, known = round(HISTORY_S / section.period_s), self._configurator.layouts
+        nodes: dict[LoopJoint, tuple[NodeLayout, ...]] = {}
+        for served, publisher in zip(self._joints, self._publishers, strict=True):
+            mine = tuple(known[role.node_id] for role in roles(served.joint, served.folder))
+            pipeline = make_pipeline(self._timed(served.joint), mine, keep=keep)
+            nodes[LoopJoint(served.joint.name, pipeline, publisher)] = mine
+        self.loop = self._port.loop = CycleLoop(
+            open_source(self._port.bus, self._devices),
+            tuple(nodes),
+            period_s=section.period_s,
+            produce=section.sync == "produce",
+            counter_overflow=section.sync_counter_overflow,
+            world_steps=self._devices is not None,
         )
+        self.loop.on_lost = self._keeper.lost
+        self._supervisor = Supervisor(self.loop, nodes, self.events, self._configurator)
         self._supervisor.bus.on_period = self._take_period
-        self._status = self._make_status()
-        for served, mine, publisher in zip(self._joints, layouts, self._publishers, strict=True):
-            self._republish(publisher, mine)(served.joint)
-        self._reloaders = self._make_reloaders(layouts)
-        self._plan_housekeeping()
-        self._rehearse()
+        self._plan()
+        self._status: list[JointStatus] = []
+        self._reloaders: list[Reloader] = []
+        for served, publisher, (loop_joint, mine) in zip(
+            self._joints, self._publishers, nodes.items(), strict=True
+        ):
+            self._serve(served, publisher, loop_joint, mine)
+        self.documents()  # once before: nothing happens for the first time in a cycle
+        for status in self._status:
+            status.begin()
+        self._publish_status("starting")
         self.loop.source.narrow(self.loop.receive_ids())
+
+    def _plan(self) -> None:
+        """Plan what is done in the slack for all joints."""
+        housekeeping = self.loop.housekeeping
+        housekeeping.urgent.append(self._supervisor.step)
+        housekeeping.every(0.01, self._check_end)
+        housekeeping.every(_CHECK_S, self._supervisor.check)
+        housekeeping.every(_CHECK_S, self._check_bus)
+        housekeeping.every(_COLLECT_S, lambda: gc.collect(0))
+        housekeeping.every(1.0, self.loop.refresh_unix_time)
+        if (watchdog_s := watchdog_period_s()) is not None:
+            housekeeping.every(watchdog_s, Watchdog(self.loop).check)
+
+    def _serve(
+        self,
+        served: ServedJoint,
+        publisher: JointPublisher | None,
+        loop_joint: LoopJoint,
+        mine: tuple[NodeLayout, ...],
+    ) -> None:
+        """Publish a joint's model, plan what is done for it in the slack, and rehearse its cycle."""
+        housekeeping, load = self.loop.housekeeping, self._configurator.load().fraction
+        joint, supervisor = self._timed(served.joint), self._supervisor
+        status = JointStatus(joint, self.loop, loop_joint, supervisor, self.events, load)
+        self._status.append(status)
+
+        def publish(joint: JointFile) -> None:
+            if publisher is not None:
+                publisher.put_joint(self._timed(joint), mine)
+
+        publish(joint)
+        if publisher is not None:
+            housekeeping.every(_STATUS_S, partial(_put_status, publisher, status))
+            housekeeping.every(_ANSWER_S, publisher.answer)
+            if (kept := joint.recording.folder) is not None:
+                feed = FindingFeed(served.folder / kept, joint.name, publisher.put_finding)
+                housekeeping.every(_FINDING_S, feed.check)
+                housekeeping.every(_FINDING_S, SnapshotFeed(loop_joint.pipeline, publisher).check)
+        if served.path is not None:
+            make: Callable[[JointFile], Built] = lambda joint: build(self._timed(joint))  # noqa: E731
+            files = served.path, served.joint
+            reloader = Reloader(*files, loop_joint.pipeline, served.move, make, publish, self.events)
+            self._reloaders.append(reloader)
+            housekeeping.urgent.append(reloader.step)
+            housekeeping.every(_FILE_S, reloader.check)
+        rehearse(served.joint)
 
     def _take_period(self, period_s: float) -> None:
         """The master has another period: begin anew with it, once the loop has ended."""
@@ -148,9 +205,7 @@ class Daemon:
         self._joints = tuple(
             replace(one, joint=present[one.path]) if one.path in present else one for one in self._joints
         )
-        known = self._configurator.layouts
-        served = [roles(one.joint, one.folder) for one in self._joints]
-        self._assemble([tuple(known[role.node_id] for role in each) for each in served])
+        self._assemble()
 
     def __enter__(self) -> Daemon:
         return self
@@ -161,7 +216,7 @@ class Daemon:
     @property
     def pipelines(self) -> tuple[JointPipeline, ...]:
         """Of the joints, in their order."""
-        return tuple(loop_joint.pipeline for loop_joint in self._loop_joints)
+        return tuple(loop_joint.pipeline for loop_joint in self.loop.loop_joints)
 
     @property
     def layouts(self) -> Mapping[int, NodeLayout]:
@@ -229,7 +284,9 @@ class Daemon:
             first = self._joints[0]
             session = open_session(first.joint.zenoh, first.folder)
             self._closing.callback(_close_in_time, session)
-            self._closing.callback(watch_router(session, self._tell_router).undeclare)
+            text = "the connection to the zenoh router is lost: who is behind it receives nothing"
+            tell = partial(self.events.keep, "router", text=text, over="the zenoh router is back")
+            self._closing.callback(watch_router(session, tell).undeclare)
         publishers: list[JointPublisher | None] = []
         for served in self._joints:
             publisher = JointPublisher(session, served.joint, express=served is self._joints[-1])
@@ -237,94 +294,9 @@ class Daemon:
             publishers.append(publisher)
         return publishers
 
-    def _tell_router(self, lost: bool) -> None:
-        text = "the connection to the zenoh router is lost: who is behind it receives nothing"
-        self.events.keep("router", lost, text, "the zenoh router is back")
-
-    def _make_loop(self) -> CycleLoop:
-        section = self._section
-        loop = CycleLoop(
-            open_source(self._port.bus, self._devices),
-            self._loop_joints,
-            period_s=section.period_s,
-            produce=section.sync == "produce",
-            counter_overflow=section.sync_counter_overflow,
-            world_steps=self._devices is not None,
-        )
-        loop.on_lost = self._keeper.lost
-        self._port.loop = loop
-        return loop
-
-    def _make_status(self) -> list[JointStatus]:
-        load = self._configurator.load().fraction
-        return [
-            JointStatus(self._timed(served.joint), self.loop, mine, self._supervisor, self.events, load)
-            for served, mine in zip(self._joints, self._loop_joints, strict=True)
-        ]
-
-    def _make_reloaders(self, layouts: Sequence[tuple[NodeLayout, ...]]) -> list[Reloader]:
-        return [
-            Reloader(
-                served.path,
-                served.joint,
-                loop_joint.pipeline,
-                served.move,
-                lambda joint: build(self._timed(joint)),
-                self._republish(publisher, mine),
-                self.events,
-            )
-            for served, loop_joint, publisher, mine in zip(
-                self._joints, self._loop_joints, self._publishers, layouts, strict=True
-            )
-            if served.path is not None
-        ]
-
-    def _plan_housekeeping(self) -> None:
-        housekeeping = self.loop.housekeeping
-        housekeeping.urgent.append(self._supervisor.step)
-        housekeeping.every(0.01, self._check_end)
-        housekeeping.every(_CHECK_S, self._supervisor.check)
-        housekeeping.every(_CHECK_S, self._check_bus)
-        housekeeping.every(_COLLECT_S, lambda: gc.collect(0))
-        housekeeping.every(1.0, self.loop.refresh_unix_time)
-        for publisher, status in zip(self._publishers, self._status, strict=True):
-            if publisher is not None:
-                housekeeping.every(_STATUS_S, partial(_put_status, publisher, status))
-                housekeeping.every(_ANSWER_S, publisher.answer)
-        for served, mine, publisher in zip(self._joints, self._loop_joints, self._publishers, strict=True):
-            kept = served.joint.recording.folder
-            if publisher is not None and kept is not None:
-                feed = FindingFeed(served.folder / kept, served.joint.name, publisher.put_finding)
-                housekeeping.every(_FINDING_S, feed.check)
-                housekeeping.every(_FINDING_S, SnapshotFeed(mine.pipeline, publisher).check)
-        for reloader in self._reloaders:
-            housekeeping.urgent.append(reloader.step)
-            housekeeping.every(_FILE_S, reloader.check)
-        watchdog_s = watchdog_period_s()
-        if watchdog_s is not None:
-            housekeeping.every(watchdog_s, Watchdog(self.loop).check)
-
     def _timed(self, joint: JointFile) -> JointFile:
         """Return a joint file with the measured period of SYNC."""
         return joint.model_copy(update={"bus": self._section})
-
-    def _republish(
-        self, publisher: JointPublisher | None, layouts: tuple[NodeLayout, ...]
-    ) -> Callable[[JointFile], None]:
-        def publish(joint: JointFile) -> None:
-            if publisher is not None:
-                publisher.put_joint(self._timed(joint), layouts)
-
-        return publish
-
-    def _rehearse(self) -> None:
-        """Rehearse the loop, so that nothing happens for the first time in a cycle."""
-        for served in self._joints:
-            rehearse(served.joint)
-        self.documents()
-        for status in self._status:
-            status.begin()
-        self._publish_status("starting")
 
     def _check_bus(self) -> None:
         if self._keeper.check():

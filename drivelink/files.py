@@ -101,11 +101,12 @@ class NewFile:
         self._place = Path(os.path.realpath(path))
         self._force = force
         try:
-            mode = _mode(self._place)
+            mode = self._place.stat().st_mode if self._place.exists() else None
             self.placed = mode is not None and not stat.S_ISREG(mode)  # whether it has its final name
             if mode is not None and not (force or self.placed):
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
-            self._temporary = self._place if self.placed else _beside(self._place)
+            hidden = f".{self._place.name[:200]}.{secrets.token_hex(4)}.tmp"  # in the same folder
+            self._temporary = self._place if self.placed else self._place.with_name(hidden)
             if mode is not None and not os.access(self._place, os.W_OK):
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))  # rename would replace it
             flags = os.O_WRONLY if self.placed else os.O_WRONLY | os.O_CREAT | os.O_EXCL
@@ -194,15 +195,3 @@ def sync(fd: int) -> None:
     except OSError as error:
         if error.errno not in (errno.EINVAL, errno.EROFS):
             raise
-
-
-def _mode(path: Path) -> int | None:
-    try:
-        return path.stat().st_mode
-    except FileNotFoundError:
-        return None
-
-
-def _beside(path: Path) -> Path:
-    """Return an unused hidden name in the same folder."""
-    return path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}.tmp")

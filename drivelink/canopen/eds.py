@@ -60,11 +60,12 @@ class DataSheet:
 
     def tpdos(self) -> tuple[Tpdo, ...]:
         """Return the TPDOs in the file; `fixed` if it declares them read-only."""
-        return tuple(replace(tpdo, fixed=self._fixed(tpdo)) for tpdo in tpdos_of(self.values()))
-
-    def _fixed(self, tpdo: Tpdo) -> bool:
-        parts = (self.objects.get((tpdo.mapping, subindex)) for subindex in (0, 1))
-        return not all(part is not None and part.writable for part in parts)
+        found = []
+        for tpdo in tpdos_of(self.values()):
+            parts = (self.objects.get((tpdo.mapping, subindex)) for subindex in (0, 1))
+            fixed = not all(part is not None and part.writable for part in parts)
+            found.append(replace(tpdo, fixed=fixed))
+        return tuple(found)
 
 
 def load_eds(path: Path, node_id: int | None = None) -> DataSheet:

@@ -25,13 +25,8 @@ def run(args: argparse.Namespace) -> int:
     parser = cli.make_parser(list(cli.VERBS))
     for action in parser._subparsers._group_actions:  # type: ignore[union-attr]
         for subparser in action.choices.values():  # type: ignore[union-attr]
-            _complete_files(subparser)
+            for argument in subparser._actions:
+                if getattr(argument.type, "__name__", "") == "Path":
+                    argument.complete = shtab.FILE
     print(shtab.complete(parser, shell=args.shell))
     return 0
-
-
-def _complete_files(parser: argparse.ArgumentParser) -> None:
-    """Arguments that are paths complete as files."""
-    for action in parser._actions:
-        if getattr(action.type, "__name__", "") == "Path":
-            action.complete = shtab.FILE  # type: ignore[attr-defined]

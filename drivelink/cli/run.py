@@ -64,7 +64,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the joints until stopped."""
-    _set_up_logging(args.log_level)
+    log_to_stderr(getattr(logging, args.log_level.upper()))
+    logging.getLogger("canopen").setLevel(logging.ERROR)
     move = partial(moved, args=args)
     loaded = [move(load(path)) for path in args.joints]
     if loaded[0].bus.interface == "virtual":
@@ -111,11 +112,6 @@ def _say_ready(names: list[str], bus: BusSection, args: argparse.Namespace) -> N
         return
     where_text = f"{bus.interface} {bus.channel}, {rate_hz:g} Hz"
     _say(f"drivelink run: {', '.join(names)} on {where_text}, ready")
-
-
-def _set_up_logging(level: str) -> None:
-    log_to_stderr(getattr(logging, level.upper()))
-    logging.getLogger("canopen").setLevel(logging.ERROR)
 
 
 def _show(daemon: Daemon, ended: threading.Event) -> None:

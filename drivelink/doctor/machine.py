@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import platform
+import re
 import resource
 import shutil
 import subprocess
@@ -36,16 +37,11 @@ def examine_machine(section: Section, period_s: float, seconds: float) -> None:
     kernel = platform.release()
     realtime = Path("/sys/kernel/realtime").exists() or "PREEMPT_RT" in platform.version()
     section.ok("kernel", f"Linux {kernel}" + (", PREEMPT_RT" if realtime else ""))
-    _rights(section, _capabilities())
+    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    effective = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
+    _rights(section, int(effective[1], 16) if effective else 0)
     _governor(section)
     _timer(section, period_s, seconds)
-
-
-def _capabilities() -> int:
-    for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
-        if line.startswith("CapEff:"):
-            return int(line.split()[1], 16)
-    return 0
 
 
 def _rights(section: Section, capabilities: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import can
@@ -158,26 +159,16 @@ def _examine_node(
     except DriveError as error:
         section.error(subject, str(error))
         return None, None
-    _judge_profile(section, role, node)
-    _judge_eds(section, role, node)
-    section.notices += survey.offer.notices
-    planned = _judge_mapping(section, role, survey)
-    if _has(bus, joint.bus, role.node_id, 0x1019):
-        report_sync_counter(section, joint.bus)
-    return survey, planned
-
-
-def _has(bus: can.BusABC, section: BusSection, node: int, index: int) -> bool:
-    try:
-        return run_program(read_optional(node, index, 0), bus, section) is not None
-    except DriveError:
-        return False
-
-
-def _judge_profile(section: Section, role: Role, node: FoundNode) -> None:
     wanted = 402 if role.motor is not None else 406
     if node.device_type and node.device_type & 0xFFFF not in (wanted, 402):
         section.warn(role.subject, f"is {node.profile}, {role.key} wants a CiA {wanted} device")
+    _judge_eds(section, role, node)
+    section.notices += survey.offer.notices
+    planned = _judge_mapping(section, role, survey)
+    with suppress(DriveError):
+        if run_program(read_optional(role.node_id, 0x1019, 0), bus, joint.bus) is not None:
+            report_sync_counter(section, joint.bus)
+    return survey, planned
 
 
 def _judge_eds(section: Section, role: Role, node: FoundNode) -> None:

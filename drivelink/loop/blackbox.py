@@ -74,17 +74,17 @@ class Ring:
         blocks = [block for block in self._blocks if block.last_s >= first_s and block.first_s <= last_s]
         if self._open:
             blocks.append(_pack(self._open))
-        return (item for block in blocks for item in _unpack(block) if first_s <= item[0] <= last_s)
+        return (
+            item
+            for block in blocks
+            for item in pickle.loads(zlib.decompress(block.packed))
+            if first_s <= item[0] <= last_s
+        )
 
 
 def _pack(items: list[Item]) -> _Block:
     packed = zlib.compress(pickle.dumps(items, pickle.HIGHEST_PROTOCOL), level=1)
     return _Block(items[0][0], items[-1][0], packed)
-
-
-def _unpack(block: _Block) -> list[Item]:
-    items: list[Item] = pickle.loads(zlib.decompress(block.packed))
-    return items
 
 
 _LOG = logging.getLogger("drivelink.recording")
@@ -184,7 +184,11 @@ class BlackBox(Sink):
             if self._model is not None and self._model[1] != payload:
                 self._model_s = self._clock()
             self._model = (name, payload, stamp_ns)
-            self._reread()
+            if self._text.path is not None:
+                try:  # anew: the daemon has it in use when it publishes another model
+                    self._text = load_text(self._text.path)
+                except JointFileError as error:
+                    _LOG.error("%s: the black box goes on with the joint file before it", error)
             return
         status = json.loads(payload)
         self._day.status(status)
@@ -254,14 +258,6 @@ class BlackBox(Sink):
     def abandon(self) -> None:
         """Write what is in memory: it is worth keeping after an error, too."""
         self.close()
-
-    def _reread(self) -> None:
-        """Read the joint file anew: the daemon has it in use when it publishes another model."""
-        if self._text.path is not None:
-            try:
-                self._text = load_text(self._text.path)
-            except JointFileError as error:
-                _LOG.error("%s: the black box goes on with the joint file before it", error)
 
     def _take(self, kind: str, *values: Any) -> None:
         self._ring.take((self._clock(), kind, values))

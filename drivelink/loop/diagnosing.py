@@ -147,7 +147,9 @@ def make(recording: Path) -> dict[str, Any]:
     outcome = diagnose(trained, model, None, held)
     change = _change(part, source.joint, outcome)
     error, state, harmful = _error(part, source.joint, change, held_from), finding.NOTHING, None
-    better = error.after_rms_nm < error.before_rms_nm and _has_changed(part, source.joint, change)
+    # Of a sufficient model, only where it fails its own test: then its numbers have changed.
+    changed = change.verdict == "effect" or (change.verdict == "sufficient" and _alarms(part, source.joint))
+    better = error.after_rms_nm < error.before_rms_nm and changed
     if not better and change.verdict != "effect":
         error = change.validation  # which the sentence is about
     said = summary(change, error, source.joint, better)
@@ -158,6 +160,7 @@ def make(recording: Path) -> dict[str, Any]:
             shown = replace(change, validation=error)  # the views have one error before and after
             apply_diagnosis.write(source, proposal_file(recording), shown, part, recording.name, force=True)
             state = finding.PROPOSED
+    first_s = next(read_messages(recording, frozenset({"sample"}))).log_time_ns * 1e-9
     runs = simulated(held, declared=model, found=apply_diagnosis.diagnosed_model(source.joint, change))
     title = report.Title(source.joint.name, recording.name, None, source.joint.axis == "linear")
     finding.write_page(recording, report.html_page(outcome, title))
@@ -166,7 +169,7 @@ def make(recording: Path) -> dict[str, Any]:
         **finding.begun(recording, state, sentence),
         "summary": said.short,
         "parameters": list(said.parameters),
-        "since": None if rose is None else _unix_s(recording, record, rose[0]),
+        "since": None if rose is None else first_s + (rose[0] - int(record.sequence[0])) * record.period_s,
         "error": error._asdict(),
         "joint_file": finding.fingerprint(source.text),
         "took_s": round(time.monotonic() - begin_s, 1),
@@ -184,13 +187,6 @@ def _read(recording: Path, source: JointText) -> Record:
     except DrivelinkError:
         return record
     return max(record, frames, key=lambda one: len(one.sequence))
-
-
-def _has_changed(part: Record, joint: JointFile, outcome: Diagnosis) -> bool:
-    """Return whether an effect was found, or the model in use fails its own test."""
-    if outcome.verdict != "sufficient":
-        return outcome.verdict == "effect"
-    return _alarms(part, joint)
 
 
 def _alarms(part: Record, joint: JointFile) -> bool:
@@ -225,12 +221,6 @@ def _error(part: Record, joint: JointFile, outcome: Diagnosis, held_from: int) -
         both.append(np.sqrt(np.mean(np.sum(squares, axis=2), axis=0)).tolist())
     (before, torque), (after, _) = both
     return Errors(before, after, before / torque, after / torque)
-
-
-def _unix_s(recording: Path, record: Record, sequence: int) -> float:
-    """UNIX time of a sample, by the stamp of the first one."""
-    first = next(read_messages(recording, frozenset({"sample"})))
-    return first.log_time_ns * 1e-9 + (sequence - int(record.sequence[0])) * record.period_s
 
 
 def main() -> int:

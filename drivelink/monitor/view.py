@@ -187,7 +187,7 @@ class JointView:
         below = status_lines(self.status, width - 4, self.model, self.finding)[: max(0, room - 1)]
         below = below if self.live else []
         if self.history.latest is not None:
-            below.append(self._flags())
+            below.append(Text.assemble(*((f"● {label}  ", ink) for label, ink in self.flags), no_wrap=True))
         room -= len(below)
         body: list[RenderableType] = [numbers, *([Text("")] if room >= 0 else [])]
         if self.help:
@@ -237,9 +237,9 @@ class JointView:
             shown = Text.assemble((value, f"bold {ink}"), extra, f" {unit}")
             rows.append((label, shown, truth if known else "", Text(sparkline(series, spark), style=ink)))
         rows += self._external(spark, ink)
-        rows.append(
-            ("deflection", f"{self.deflections('   ')} rad", "" if known else self._each(estimate), "")
-        )
+        several = [number(one.stiffness_nm_rad) for one in estimate.transmissions]
+        each = f"each {' | '.join(several)}" if several[1:] and not known else ""
+        rows.append(("deflection", f"{self.deflections('   ')} rad", each, ""))
         for row in rows:
             table.add_row(*row[: len(table.columns)])
         return table
@@ -259,12 +259,6 @@ class JointView:
         return [
             ("external", shown, contact if touch.valid else doubt, Text(sparkline(series, spark), style=ink))
         ]
-
-    @staticmethod
-    def _each(estimate: EstimateMessage) -> str:
-        if len(estimate.transmissions) < 2:
-            return ""
-        return "each " + " | ".join(number(one.stiffness_nm_rad) for one in estimate.transmissions)
 
     @staticmethod
     def _legend() -> Table:
@@ -356,12 +350,6 @@ class JointView:
         series = [(time_s, ratio, True) for time_s, ratio in self.history.residuals]
         title = "residual over time, × its baseline"
         return self._time_plot(width, height, title, series, empty=shape(self.status or {}).no_gauge)
-
-    def _flags(self) -> Text:
-        text = Text(no_wrap=True)
-        for label, style in self.flags:
-            text.append(f"● {label}  ", style=style)
-        return text
 
 
 def flags(status: int) -> list[tuple[str, str]]:

@@ -90,9 +90,10 @@ def sections(
             rows += parameter_rows(name, getattr(motor, name), one.nuisance_std[key], units)
         rows += _effects(motor.effects, units)
         title = f"motor {index}: {'rigid' if one.model == RIGID else one.model}"
-        made.append(
-            Section(title, [Grid(PARAMETER_HEAD, rows), Lines((_balance(one, units), *_remarks(one)))])
-        )
+        left = f"{number(one.error_rms_nm, 3)} {units.shown('N·m')} rms left"
+        whole = "flexibility torque" if one.excited else "motor torque"
+        balance = f"torque balance: {left}, {_share(one)} of the {whole}"
+        made.append(Section(title, [Grid(PARAMETER_HEAD, rows), Lines((balance, *_remarks(one)))]))
     if found.model.link is not None or found.model.link_effects:
         rows = []
         for name, x in link_entry(found.model).get("dynamics", {}).items():
@@ -120,12 +121,6 @@ def _effects(effects: Iterable[Effect], units: Units) -> Rows:
         for name, value in effect.parameters.items()
         for row in parameter_rows(f"{effect.name}.{name}", value, effect.std.get(name), units)
     ]
-
-
-def _balance(one: TransmissionFit, units: Units) -> str:
-    whole = "flexibility torque" if one.excited else "motor torque"
-    left = f"{number(one.error_rms_nm, 3)} {units.shown('N·m')} rms left"
-    return f"torque balance: {left}, {_share(one)} of the {whole}"
 
 
 def _share(one: TransmissionFit) -> str:

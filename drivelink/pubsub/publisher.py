@@ -76,7 +76,10 @@ class JointPublisher:
             self._latched = {name: self._latch(name) for name in DOCUMENTS}
             self._answer("schema", to_json(schema()))
             self.put_joint(joint)
-            self._ros2 = self._open_ros2(joint)
+            if joint.ros2 is not None and joint.ros2.enabled:
+                from drivelink.pubsub.ros2 import Ros2Publisher  # loaded where it is asked for
+
+                self._ros2 = Ros2Publisher(session, joint)
             self._alive(self.key + "/alive")
         except zenoh.ZError as error:
             self.close()
@@ -157,14 +160,6 @@ class JointPublisher:
         self._alive(own)
         if any(other < own for other in self._served() if other != self.key + "/alive"):
             raise ZenohError(taken)
-
-    def _open_ros2(self, joint: JointFile) -> Ros2Publisher | None:
-        """Return the joint as a ROS 2 node, if declared."""
-        if joint.ros2 is None or not joint.ros2.enabled:
-            return None
-        from drivelink.pubsub.ros2 import Ros2Publisher
-
-        return Ros2Publisher(self._session, joint)
 
     def _served(self) -> list[str]:
         replies = self._session.liveliness().get(f"{self.key}/alive/**", timeout=_CLAIM_TIMEOUT_S)

@@ -183,11 +183,6 @@ def daemon_config(endpoint: str, listen: bool) -> zenoh.Config:
     return _config({"listen/endpoints": ["tcp/127.0.0.1:0"], "connect/endpoints": [endpoint], **_CONNECT})
 
 
-def client_config(endpoint: str) -> zenoh.Config:
-    """Return a peer that only connects to `endpoint`, and through it to the machine's daemons."""
-    return _config({"listen/endpoints": [], "connect/endpoints": [endpoint], **_CONNECT})
-
-
 def open_session(section: ZenohSection, base_dir: Path) -> zenoh.Session:
     """Open the daemon's session, connected to the other daemons of the machine.
 
@@ -198,7 +193,10 @@ def open_session(section: ZenohSection, base_dir: Path) -> zenoh.Session:
         ZenohError: the configuration file cannot be used, the endpoint is taken by another program, or too
             few files may be open.
     """
-    _allow_files()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
     _require_files()
     if section.config is not None:
         return _open(_read(base_dir / section.config))
@@ -224,15 +222,9 @@ def open_client(endpoint: str, config: str | Path | None = None) -> zenoh.Sessio
     _require_files()
     if config is not None:
         return _open(_read(Path(config)))
-    return _open(client_config(_require_endpoint(endpoint)))
-
-
-def _allow_files() -> None:
-    """Raise the process's limit of open files to `FILES`, as far as it is permitted."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    # A peer that only connects, and through the one that it reaches to the machine's daemons.
+    connects = {"listen/endpoints": [], "connect/endpoints": [_require_endpoint(endpoint)], **_CONNECT}
+    return _open(_config(connects))
 
 
 def _require_files() -> None:

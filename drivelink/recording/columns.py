@@ -182,7 +182,8 @@ def record_from_columns(
     columns = {**columns, **dict.fromkeys(ignored, np.empty(0))}
     if unknown := [name for name in columns if name not in COLUMNS]:
         _LOG.warning("%s: ignored column(s) %s", where, some(unknown, 40))
-    columns = _scaled(columns, joint)
+    factors = joint.recording.scale if joint else {}
+    columns = {name: x * factors[name] if name in factors else x for name, x in columns.items()}
     motors = _motors(columns, joint, where)
     _require(columns, "time_s", where)
     columns, grid = _on_grid(columns, where, joint.bus.period_s if joint else None)
@@ -319,12 +320,6 @@ def _usable(needed: Sequence[FloatArray], where: str) -> NDArray[np.bool_]:
     if int(np.count_nonzero(usable)) < 3:
         raise RecordingError(f"{where}: expected at least 3 complete samples, got {np.count_nonzero(usable)}")
     return usable
-
-
-def _scaled(columns: Mapping[str, FloatArray], joint: JointFile | None) -> Mapping[str, FloatArray]:
-    """Columns times the factors of the joint file's [recording]."""
-    factors = joint.recording.scale if joint else {}
-    return {name: values * factors.get(name, 1.0) for name, values in columns.items()} if factors else columns
 
 
 def _repeats(columns: Mapping[str, FloatArray]) -> NDArray[np.bool_]:

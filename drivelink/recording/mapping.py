@@ -101,7 +101,12 @@ def joint_of(path: Path, named: Path | None) -> JointText:
         return jointfile.load_text(named)
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
-    carried = _carried(path)
+    carried: bytes | None = None
+    if path.suffix.lower() == ".mcap":
+        message = next(read_messages(path, frozenset({"joint"})), None)
+        carried = message.data if message is not None else None
+    elif path.suffix.lower() in CAN_SUFFIXES:
+        carried = _read_side(path)
     if carried is None:
         raise UsageError(f"--joint: expected the joint file that {path} was recorded with")
     try:
@@ -124,15 +129,6 @@ def contained(joint: JointFile) -> JointFile:
     link = joint.link.model_copy(update={"encoder": encoder})
     zenoh = ZenohSection(prefix=joint.zenoh.prefix)
     return joint.model_copy(update={"motor": tuple(motors), "link": link, "zenoh": zenoh})
-
-
-def _carried(path: Path) -> bytes | None:
-    """Return the document with the joint file's text, if any."""
-    suffix = path.suffix.lower()
-    if suffix == ".mcap":
-        message = next(read_messages(path, frozenset({"joint"})), None)
-        return message.data if message is not None else None
-    return _read_side(path) if suffix in CAN_SUFFIXES else None
 
 
 def _read_side(path: Path) -> bytes | None:

@@ -33,7 +33,7 @@ from drivelink.recording.messages import (
 from drivelink.recording.sinks import SafeFile
 from estimator.online import Estimator
 from estimator.reasons import percent, why_not_valid
-from estimator.sample import SIGMA_95, FloatArray, Sample, Status
+from estimator.sample import SIGMA_95, FloatArray, Status
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -55,17 +55,19 @@ class Playback:
         joint: JointFile,
         period_s: float,
         total: int | None,
-        cycles: Callable[[JointPipeline], Iterator[Played]],
+        cycles: Callable[[JointPipeline], Iterable[Cycle]],
+        start_s: float = 0.0,
     ) -> None:
         self.motors = len(joint.motor)  # number of motors
         self.period_s = period_s  # of recording and estimator
         self.total = total  # number of cycles, if known
         # Samples are its input, by whatever they were made.
         self.pipeline = JointPipeline(Assembler((), 0), *build(joint.timed(period_s)))
-        self._cycles = cycles
+        self._cycles, self._start_s = cycles, start_s
 
     def __iter__(self) -> Iterator[Played]:
-        return self._cycles(self.pipeline)
+        for tick in estimated(self._cycles(self.pipeline), self.pipeline):
+            yield Played(self._start_s + tick.sequence * self.period_s, tick)
 
 
 def open_playback(
@@ -89,34 +91,18 @@ def open_playback(
     Raises:
         RecordingError: it cannot be read, or is incomplete.
     """
-    period_s, recorded, state = joint.bus.period_s, None, None
     if is_frame_log(path, frames):
         log = FrameLog(path, joint, base_dir, channel)
-        period_s, recorded = log.period_s, log.cycles()
-    elif path.suffix.lower() == ".mcap":
+        return Playback(joint, log.period_s, None, lambda _: log.cycles())
+    if path.suffix.lower() == ".mcap":
         recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)
         state = _state(path, joint)
-    if recorded is not None:
-        return Playback(
-            joint,
-            period_s,
-            None,
-            lambda pipeline: _played(estimated(_after(state, recorded, pipeline, path), pipeline), period_s),
-        )
+        after = lambda pipeline: _after(state, recorded, pipeline, path)  # noqa: E731
+        return Playback(joint, joint.bus.period_s, None, after)
     record = read(path, joint, keep_nan=True, names=names)
-    times = record.time_s.tolist()
-    return Playback(
-        joint,
-        record.period_s,
-        len(record),
-        lambda pipeline: _from_samples(record.samples(), times, pipeline),
-    )
-
-
-def _from_samples(samples: Iterable[Sample], times: list[float], pipeline: JointPipeline) -> Iterator[Played]:
-    step = pipeline.step
-    for time_s, sample in zip(times, samples, strict=True):
-        yield Played(time_s, step(sample, 0, round(time_s * 1e9)))
+    stamps = (round(time_s * 1e9) for time_s in record.time_s.tolist())
+    cycles = (Cycle(one.sequence, at, one, 0) for one, at in zip(record.samples(), stamps, strict=True))
+    return Playback(joint, record.period_s, len(record), lambda _: cycles, record.start_s)
 
 
 def _state(path: Path, joint: JointFile) -> bytes | None:
@@ -149,11 +135,6 @@ def _after(
         _LOG.warning("%s: the estimator begins anew: %s", path, error)
         return cycles
     return dropwhile(lambda cycle: cycle.sequence <= last, cycles)
-
-
-def _played(ticks: Iterable[Tick], period_s: float) -> Iterator[Played]:
-    for tick in ticks:
-        yield Played(tick.sequence * period_s, tick)
 
 
 _STATUS_EVERY_S = 0.25

@@ -71,9 +71,10 @@ def installation(
     _check_bus(interface, channel, path)
     can, serial = interface == "socketcan", interface in _SERIAL
     seen = _below_home([path.parent, executable.parent, *_python()])
+    escaped = channel.replace("-", "\\x2d")  # in the name of a unit
     values = {
         "name": joint.name,
-        "device": f"sys-subsystem-net-devices-{_escape(channel)}.device" if can else "",
+        "device": f"sys-subsystem-net-devices-{escaped}.device" if can else "",
         "executable": _plain(executable),
         "joint": " ".join((_plain(path), *map(_plain, bus))),
         "folder": _plain(path.parent),
@@ -146,11 +147,6 @@ def _plain(word: Path | str) -> str:
     if not _BARE.fullmatch(str(word)):
         raise UsageError(f"{word}: expected no spaces and special characters for a unit")
     return str(word)
-
-
-def _escape(channel: str) -> str:
-    """Return a name escaped for the name of a unit."""
-    return channel.replace("-", "\\x2d")
 
 
 def _address(text: str) -> str:

@@ -1,27 +1,41 @@
 """Every choice constant of `estimator/`, halved and doubled: does any figure get worse by more than a fifth?
 
     python benchmarks/constants.py [--only NAME,…] [--seeds N]
+    python benchmarks/constants.py --compiled [--only NAME,…] [--joints N]
 
 A choice is an entry of `estimator.choices.CHOICES` or `estimator.priors.PRIORS`; `tests/literals.py` says
 what other numbers are. The figures are formed with half and with twice its value (of a share above one half:
-of what it leaves to one), in a forked process, on a few short recordings that are made once. A figure that
-gets worse by more than a fifth names a mechanism to replace, not a number: such changes are shown. An entry
-of `estimator/core/src/choices.rs` keeps its value where it is compiled: `compiled.py` varies it there.
+of what it leaves to one). A figure that gets worse by more than a fifth names a mechanism to replace, not a
+number: such changes are shown.
+
+Without --compiled they are formed in a forked process, on a few short recordings that are made once. With it
+the sources are copied, one number of `estimator/core/src/choices.rs` changed, the core compiled, and random
+joints (`estimators.py --mixed`) run with it: the share of time without a usable estimate, the share of that
+which is wrong, and the share of 95 % intervals that do not hold.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import resource
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import scene
 from diagnosis_seeds import joint_of, measured, wrong_and_certain
 from scene import gatekit, literals
 
+from estimator.choices import ON_LINE
 from estimator.diagnosis import diagnose
 from estimator.gate import examine
 from estimator.model import JointModel
@@ -40,6 +54,20 @@ EFFECTS: tuple[tuple[str, ...], ...] = (
     ("cogging", "motor_inertia"),
 )
 FIGURES = ("missed", "surplus", "certain", "left", "stiffness", "refused", "unnamed")  # better the smaller
+OF_JOINTS = ("unusable", "wrong", "uncovered")
+CHANCE = 0.005  # of the time: what a figure of random joints may change by chance
+TABLE = "estimator/core/src/choices.rs"
+LOAD = """
+import importlib.machinery, importlib.util, runpy, sys
+_, core, program, *sys.argv[1:] = sys.argv
+loader = importlib.machinery.ExtensionFileLoader("estimator._core", core)
+spec = importlib.util.spec_from_loader("estimator._core", loader, origin=core)
+sys.modules["estimator._core"] = module = importlib.util.module_from_spec(spec)
+loader.exec_module(module)
+sys.argv[0] = program
+sys.path.insert(0, program.rpartition("/")[0])
+runpy.run_path(program, run_name="__main__")
+"""
 
 
 class Case(NamedTuple):
@@ -52,6 +80,7 @@ class Case(NamedTuple):
 
 
 Fault = tuple[Record, JointModel, dict[str, float]]
+Found = dict[str, float] | str  # the figures, or what a change breaks
 
 
 def cases(seeds: int) -> Iterator[Case]:
@@ -78,7 +107,7 @@ def undone(factors: dict[str, float], record: Record, model: JointModel) -> bool
 
 
 def figures(recordings: Sequence[Case], faulty: Sequence[Fault]) -> dict[str, float]:
-    """What is judged."""
+    """What is judged of an interpreted choice."""
     found: dict[str, list[float]] = {name: [] for name in FIGURES}
     for case in recordings:
         outcome = diagnose(case.record, case.model)
@@ -96,9 +125,18 @@ def figures(recordings: Sequence[Case], faulty: Sequence[Fault]) -> dict[str, fl
     return {name: float(middle.get(name, sum)(values)) for name, values in found.items()}
 
 
+def times(value: Any, factor: float) -> Any:
+    """A choice with a factor; whole numbers stay whole and above zero."""
+    if isinstance(value, tuple):
+        return tuple(times(x, factor) for x in value)
+    if 0.5 < value < 1.0:  # a share
+        return 1.0 - (1.0 - value) / factor
+    return max(1, round(value * factor)) if isinstance(value, int) else value * factor
+
+
 def forked(
     recordings: Sequence[Case], faulty: Sequence[Fault], constant: literals.Constant | None, factor: float
-) -> dict[str, float] | str:
+) -> Found:
     """The figures with one constant changed, in a process that ends with it; or what that breaks."""
     reader, writer = os.pipe()
     child = os.fork()
@@ -106,7 +144,10 @@ def forked(
         resource.setrlimit(resource.RLIMIT_CPU, (LONGEST_S, LONGEST_S))
         try:
             if constant is not None:
-                constant.set(factor)
+                entry = constant.table[constant.key]
+                field = "std" if hasattr(entry, "std") else "value"
+                changed = {field: times(getattr(entry, field), factor)}
+                constant.table[constant.key] = entry._replace(**changed)
             outcome: object = figures(recordings, faulty)
         except Exception as error:  # noqa: BLE001 - whatever a wild constant breaks is the answer
             outcome = f"{type(error).__name__}: {error}"
@@ -117,28 +158,75 @@ def forked(
     with os.fdopen(reader, encoding="utf-8") as pipe:
         text = pipe.read()
     os.waitpid(child, 0)
-    made: dict[str, float] | str = json.loads(text) if text else "it took too long, or died"
+    made: Found = json.loads(text) if text else "it took too long, or died"
     return made
 
 
-def rows(args) -> Iterator[scene.Row]:
+@contextmanager
+def copied() -> Iterator[Path]:
+    """What the core is compiled of, in a folder of its own."""
+    with tempfile.TemporaryDirectory() as name:
+        for part in ("Cargo.toml", "Cargo.lock", "estimator/core", "drivelink/core"):
+            source, place = scene.ROOT / part, Path(name) / part
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copytree(source, place) if source.is_dir() else shutil.copy(source, place)
+        yield Path(name)
+
+
+def compiled(folder: Path, joints: int, name: str | None, factor: float) -> Found:
+    """The figures with one entry of the compiled table changed, or what that breaks."""
+    text = (scene.ROOT / TABLE).read_text(encoding="utf-8")
+    if name is not None:
+        line = re.search(rf"(?m)^    {name.upper()}: (\w+) = ([\d.e-]+),", text)
+        assert line is not None, name
+        value = times((float if line[1] == "f64" else int)(line[2]), factor)
+        text = f"{text[: line.start(2)]}{value!r}{text[line.end(2) :]}"
+    (folder / TABLE).write_text(text, encoding="utf-8")
+    command = ["cargo", "rustc", "-q", "--release", "--locked", "--lib", "--features", "python"]
+    command += ["--manifest-path", "drivelink/core/Cargo.toml", "--crate-type", "cdylib"]
+    subprocess.run(command, cwd=folder, env=os.environ | {"PYO3_PYTHON": sys.executable}, check=True)
+    core, program = next((folder / "target/release").glob("*drivelink_core.so")), "estimators.py"
+    command = [sys.executable, "-c", LOAD, str(core), str(Path(__file__).with_name(program)), "--mixed"]
+    command += ["--joints", str(joints), "--json", str(folder / "rows.json")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        return done.stderr.strip().splitlines()[-1]
+    whole = json.loads((folder / "rows.json").read_text(encoding="utf-8"))[-1]
+    return dict(zip(OF_JOINTS, (1.0 - whole["usable"], whole["wrong"], 1.0 - whole["coverage"]), strict=True))
+
+
+def judged(
+    chosen: dict[str, Any], figures: Callable[[Any, float], Found], chance: float
+) -> Iterable[scene.Row]:
     """The figures as they are, and each change that makes one worse by more than a fifth."""
-    chosen = [
-        c for c in literals.constants(scene.ROOT / "estimator") if not args.only or c.label in args.only
-    ]
-    recordings, faulty = list(cases(args.seeds)), list(faults())
-    usual = forked(recordings, faulty, None, 1.0)
+    usual = figures(None, 1.0)
     if isinstance(usual, str):
         raise SystemExit(usual)
-    yield {"constant": "as it is", "factor": 1.0, "worse": None, "tried": 2 * len(chosen), **usual}
-    for constant in chosen:
+    nothing = dict.fromkeys((*FIGURES, *OF_JOINTS, "worse"))
+    yield nothing | usual | {"constant": "as it is", "factor": 1.0, "tried": len(chosen) * len(FACTORS)}
+    for label, constant in chosen.items():
         for factor in FACTORS:
-            found = forked(recordings, faulty, constant, factor)
-            row = {"constant": constant.label, "factor": factor}
+            found = figures(constant, factor)
+            row = nothing | {"constant": label, "factor": factor}
             if isinstance(found, str):
-                yield row | dict.fromkeys(FIGURES) | {"worse": found}
-            elif worse := [name for name in FIGURES if found[name] > FIFTH * usual[name] + 1e-12]:
+                yield row | {"worse": found}
+            elif worse := [name for name in usual if found[name] > FIFTH * usual[name] + chance]:
                 yield row | found | {"worse": ", ".join(worse)}
+
+
+def rows(args) -> Iterator[scene.Row]:
+    """Those of the interpreted choices, or of the compiled ones."""
+    if args.compiled:
+        with copied() as folder:
+            names = {name: name for name in args.only or ON_LINE}
+            yield from judged(names, partial(compiled, folder, args.joints), CHANCE)
+        return
+    chosen = {
+        one.label: one
+        for one in literals.constants(scene.ROOT / "estimator")
+        if not args.only or one.label in args.only
+    }
+    yield from judged(chosen, partial(forked, list(cases(args.seeds)), list(faults())), 1e-12)
 
 
 COLUMNS = {
@@ -151,6 +239,9 @@ COLUMNS = {
     "stiffness off, log": "{stiffness:.3g}",
     "healthy joints refused": "{refused:.0f}",
     "faults not named": "{unnamed:.0f}",
+    "not usable": "{unusable:.1%}",
+    "wrong of usable": "{wrong:.2%}",
+    "not held": "{uncovered:.1%}",
     "worse by more than a fifth": "{worse}",
 }
 
@@ -159,8 +250,10 @@ if __name__ == "__main__":
         __doc__,
         rows,
         COLUMNS,
+        scene.Option("--compiled", False, "those of the compiled core"),
         scene.Option("--only", [], "of choices, as choices.order; all if left out"),
         scene.Option("--seeds", 1, "simulated joints of each kind"),
+        scene.Option("--joints", 40, "random ones, with --compiled"),
         after=lambda found: (
             f"{len(found) - 1} of {found[0]['tried']} changes make a figure worse by more than a fifth."
         ),

@@ -188,20 +188,10 @@ class Constant(NamedTuple):
     def label(self) -> str:
         return f"{self.module.removeprefix('estimator.')}.{self.key or self.name}"
 
-    def set(self, factor: float) -> None:
-        """Put an entry of a table in with a factor, for this process; whole numbers stay whole and above zero."""
-        table = getattr(importlib.import_module(self.module), self.name)
-        entry = table[self.key]
-        field = "std" if hasattr(entry, "std") else "value"
-        table[self.key] = entry._replace(**{field: _times(getattr(entry, field), factor)})
-
-
-def _times(value: Any, factor: float) -> Any:
-    if isinstance(value, tuple):
-        return tuple(_times(x, factor) for x in value)
-    if 0.5 < value < 1.0:  # a share
-        return 1.0 - (1.0 - value) / factor
-    return max(1, round(value * factor)) if isinstance(value, int) else value * factor
+    @property
+    def table(self) -> Any:
+        """What it is an entry of."""
+        return getattr(importlib.import_module(self.module), self.name)
 
 
 def constants(estimator: Path) -> Iterator[Constant]:

@@ -12,7 +12,7 @@ from estimator.effects import elements
 from estimator.model import JointModel, Motor
 from estimator.ranges import require_in_range
 from estimator.reasons import reason_text
-from estimator.sample import Consistency, Estimate, External, Sample
+from estimator.sample import SIGMA_95, Consistency, Estimate, External, Sample
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import MODELS, RIGID, UNKNOWN, transmission_model
 
@@ -204,15 +204,22 @@ _REASONS = {
 def _in_words(signal: str, motor: int, reason: str, amount: float, std: float) -> str:
     which = _SIGNALS[signal] if motor == 0 else f"{_SIGNALS[signal]} of motor {motor}"
     if reason == "scale":
-        why = f"its scale is {1.0 + amount:.3g} ± {std:.1g} times what it was"
+        why = f"its scale is {_with_interval(1.0 + amount, std)} times what it was"
     elif reason == "delay":
-        why = f"it is {1e3 * amount:.2g} ± {1e3 * std:.1g} ms later than it was"
+        why = f"it is {_with_interval(1e3 * amount, 1e3 * std)} ms later than it was"
     elif reason == "zero":
         unit = "N·m" if signal == "motor_torque" else "rad"
-        why = f"it has moved by {amount:.2g} ± {std:.1g} {unit}"
+        why = f"it has moved by {_with_interval(amount, std)} {unit}"
     else:
         why = _REASONS[reason]
     return f"{which}: {why}"
+
+
+def _with_interval(value: float, std: float) -> str:
+    """Return a value and half its 95 % interval, both to the second digit of the latter."""
+    half = SIGMA_95 * std
+    decimals = max(0, 1 - math.floor(math.log10(half))) if 0.0 < half < math.inf else 3
+    return f"{value:.{decimals}f} ± {half:.{decimals}f}"
 
 
 def make_estimator(model: JointModel, settings: EstimatorSettings, period_s: float) -> Estimator:

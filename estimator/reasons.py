@@ -76,8 +76,9 @@ def reason_text(
 
 
 def percent(share: float, decimals: int) -> str:
-    """Return a share of one in per cent, with a space before the sign: "12.01 %"."""
-    return f"{100.0 * share:.{decimals}f} %"
+    """Return a share of one in per cent, of four digits at most: "12.01 %", "5621 %"."""
+    whole = len(f"{abs(100.0 * share):.0f}")
+    return f"{100.0 * share:.{max(0, min(decimals, 4 - whole))}f} %"
 
 
 def why_not_valid(status: int, estimator: Estimator) -> tuple[str, str] | None:

@@ -142,6 +142,16 @@ def test_a_motor_that_its_controller_holds_is_not_called_wrong(kp, hand_rad):
     assert any("sign" in text and "motor" in text for text in judgement.undecided), judgement
 
 
+def test_several_quantities_are_spoken_of_in_the_plural():
+    drawn = gatekit.draw("soft", 5)
+    light = replace(
+        drawn.model,
+        motors=tuple(replace(m, inertia_kg_m2=60.0 * m.inertia_kg_m2) for m in drawn.model.motors),
+    )
+    said = judge(drawn.record, light).remark
+    assert "times the declared inertia (or else: the positions look like degrees" in said, said
+
+
 def test_a_torque_that_is_only_noise_and_a_short_recording_decide_nothing():
     drawn = gatekit.draw("soft", 5)
     noise = np.random.default_rng(1).normal(0.0, 1e-3, drawn.record.motor_torque_nm.shape)

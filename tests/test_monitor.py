@@ -354,6 +354,12 @@ def test_the_residual_is_a_gauge_against_its_baseline_before_and_after():
     assert "residual 3.0" in view.line() and "8.1 % before its effects, 1.2 % after" in view.line()
 
 
+def test_every_gauge_of_a_pair_and_its_link_is_seen_at_80_columns():
+    alarm = {"active": False, "residual_nm": [0.03, 0.02, 0.01], "floor_nm": [0.02, 0.02, 0.02]}
+    residual = status_lines(STATUS | {"transmissions": [{}, {}], "residual_alarm": alarm}, 76)[2].plain
+    assert "motor 1" in residual and "motor 2" in residual and residual.rstrip().endswith("0.50 ×"), residual
+
+
 def test_every_view_says_what_to_do_on_a_model_alarm():
     view = filled()
     view.status = ALARM

@@ -10,7 +10,8 @@ import pytest
 from onlinekit import PERIOD_S, declared, motion
 
 from estimator import EstimatorError, EstimatorSettings, Sample, Status, make_estimator
-from estimator.reasons import CHANGES, REASONS, reason_text, why_not_valid
+from estimator.online import _in_words
+from estimator.reasons import CHANGES, REASONS, percent, reason_text, why_not_valid
 
 CORE = Path(__file__).parent.parent / "estimator" / "core" / "src"
 
@@ -118,3 +119,21 @@ def test_the_sentences_are_those_of_the_documentation():
     text = reason_text("changed", motor=2, changes=["torque_scale", "stiffness"])
     assert text == "motor 2: torque gain or stiffness has changed"
     assert reason_text("changed") == "the joint has changed"
+
+
+def test_what_is_suspected_has_the_digits_that_its_interval_leaves():
+    said = _in_words("motor_position", 1, "scale", 0.4, 0.00035)
+    assert said == "motor position of motor 1: its scale is 1.40000 ± 0.00069 times what it was"
+    assert _in_words("link_position", 0, "zero", 0.0213, 0.004).endswith("by 0.0213 ± 0.0078 rad")
+    assert _in_words("motor_torque", 2, "delay", 0.0123, 0.0).endswith(
+        "it is 12.300 ± 0.000 ms later than it was"
+    )
+
+
+def test_a_share_has_four_digits_at_most():
+    assert [percent(x, 2) for x in (0.0057, 0.1201, 1.0283, 56.2052)] == [
+        "0.57 %",
+        "12.01 %",
+        "102.8 %",
+        "5621 %",
+    ]

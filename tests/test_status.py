@@ -128,6 +128,8 @@ def test_a_model_alarm_that_flickers_is_counted_whatever_its_residual(events, ca
     assert len(caplog.records) == 2
     assert [event["count"] for event in events.recent()] == [500, 500]
     assert "3.3 times its baseline" in events.recent()[0]["text"]
+    alarmed(watch, Status.MODEL_ALARM, [14.4])
+    assert "is 480 times its baseline" in events.recent()[0]["text"]
 
 
 def test_emergencies_with_other_bytes_of_the_maker_and_faults_of_one_kind_in_one_place_are_counted(
@@ -148,7 +150,7 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(events,
     for _ in range(2):
         alarmed(watch, Status.VALID, [0.02, 0.01], "", (0.03, 0.02))
     begun, over = caplog.messages
-    said = "elbow: model alarm: the residual is 3 times its baseline, likely at the transmission"
+    said = "elbow: model alarm: the residual is 3.0 times its baseline, likely at the transmission"
     assert begun.startswith(said) and "drivelink diagnose" in begun
     assert over == "elbow: the model alarm is over"
 

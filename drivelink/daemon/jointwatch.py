@@ -13,6 +13,7 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.loop import LoopJoint
 from drivelink.cycle.objectcheck import contradicted
 from drivelink.daemon.status import EventLog
+from drivelink.output.numbers import number
 from estimator.model_monitor import ModelMonitor
 from estimator.sample import Status
 
@@ -139,7 +140,7 @@ def residual_text(monitor: ModelMonitor | None) -> str:
     location = monitor.describe().get("location") if monitor is not None else None
     ratio = residual_ratio(monitor)
     where = f", likely at the {location}" if location else ""
-    return "" if ratio is None else f": the residual is {ratio:.2g} times its baseline{where}"
+    return "" if ratio is None else f": the residual is {number(ratio, 2)} times its baseline{where}"
 
 
 def residual_ratio(monitor: ModelMonitor | None) -> float | None:

@@ -288,7 +288,7 @@ def status_lines(
     rows: list[tuple[str, list[tuple[str, str]]]] = [
         ("cycle", [(_cycle(shown), "")]),
         ("nodes", _nodes(shown)),
-        ("residual", _gauges(shown)),
+        ("residual", _gauges(shown, width - _LABEL)),
         ("not valid", [(shown.not_valid, "red")]),
         ("look here", [(advice if shown.alarm else "", "bold red")]),
         ("look here", [("; ".join(shown.wrong), "bold red")]),
@@ -317,16 +317,20 @@ def _nodes(shown: Shown) -> list[tuple[str, str]]:
     return parts
 
 
-def _gauges(shown: Shown) -> list[tuple[str, str]]:
-    """Gauges of each residual, half full at the baseline."""
+def _gauges(shown: Shown, width: int) -> list[tuple[str, str]]:
+    """Gauges of each residual, half full at the baseline; shorter, without their unit, where it is narrow."""
     if not shown.balances:
         return [(_residual(shown).removeprefix("residual "), "")]
-    parts = []
-    for balance in shown.balances:
-        style = "bold red" if shown.alarm and balance.ratio == shown.ratio else "green"
-        parts += [(f"{balance.name} " if len(shown.balances) > 1 else "", "dim")]
-        parts += [(gauge(balance.ratio, _FULL, _GAUGE), style), (f" {number(balance.ratio, 2)} ×  ", "")]
-    parts.append(("of the baseline  ", "dim"))
+    parts: list[tuple[str, str]] = []
+    for bar, unit in ((_GAUGE, "of the baseline  "), (_GAUGE // 2, "")):
+        parts = []
+        for balance in shown.balances:
+            style = "bold red" if shown.alarm and balance.ratio == shown.ratio else "green"
+            parts += [(f"{balance.name} " if len(shown.balances) > 1 else "", "dim")]
+            parts += [(gauge(balance.ratio, _FULL, bar), style), (f" {number(balance.ratio, 2)} ×  ", "")]
+        parts.append((unit, "dim"))
+        if sum(len(text) for text, _ in parts) <= width:
+            break
     if shown.improved is not None:
         before, after = (100 * part for part in shown.improved)
         parts.append((f"effects: {before:.1f} → {after:.1f} %", "dim"))

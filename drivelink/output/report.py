@@ -28,7 +28,7 @@ from drivelink.output.document import (
     page,
     parameter_rows,
 )
-from drivelink.output.numbers import Units, among
+from drivelink.output.numbers import Units, among, number
 from drivelink.output.sentences import (
     SURE,
     free_curve,
@@ -239,7 +239,7 @@ def _choice_of(outcome: Diagnosis, chosen: list[float]) -> str:
         error, curve = outcome.validation, free_curve(outcome)
         if curve is not None and error.after_rms_nm < error.before_rms_nm:
             over = " and ".join(map(in_words, curve.coordinates))
-            return f"None was chosen: a free curve over {over} leaves less."
+            return f"None was chosen: what is missing has no name; a free curve over {over} stands for it."
         return "None was chosen: alone or together they predict other stretches no better."
     left = percent(outcome.train.after_relative, 2)
     together = f" together; together they leave {left}" if len(chosen) > 1 else ""
@@ -289,7 +289,7 @@ def _is_function(curve: Curve) -> bool:
 def _stiffness_chart(curve: StiffnessCurve, units: Units) -> Chart:
     zero = int(np.argmin(np.abs(curve.deflection_rad)))
     before, after = (
-        f"{100.0 * SIGMA_95 * std[zero] / abs(value[zero]):.2g} %" if value[zero] else "no stiffness"
+        f"{number(100.0 * SIGMA_95 * std[zero] / abs(value[zero]), 2)} %" if value[zero] else "no stiffness"
         for value, std in (
             (curve.before_nm_rad, curve.before_std_nm_rad), (curve.after_nm_rad, curve.after_std_nm_rad)
         )

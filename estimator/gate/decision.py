@@ -54,14 +54,20 @@ class Discrepancy:
         return _named(self.changes, self.motors)
 
     def __str__(self) -> str:
-        text = f"{self.subject} {self.what}"
-        if len(self.changes) > 1:
-            for one, many in (("looks", "look"), ("has", "have"), ("is", "are"), ("does", "do")):
-                text = text.replace(f" {one} ", f" {many} ", 1)
+        text = _said(self.changes, self.what, self.motors)
         others = [_named(changes, self.motors) for changes in self.alternatives]
         if others := [name for name in dict.fromkeys(others) if name != self.subject]:
             text += f" (or else: {' or '.join(others)}; this motion does not decide)"
         return text
+
+
+def _said(changes: Sequence[Change], what: str, motors: int) -> str:
+    """What is said of a quantity or, in the plural, of several."""
+    text = f"{_named(changes, motors)} {what}"
+    if len(changes) > 1:
+        for one, many in (("looks", "look"), ("has", "have"), ("is", "are"), ("does", "do")):
+            text = text.replace(f" {one} ", f" {many} ", 1)
+    return text
 
 
 def _named(changes: Sequence[Change], motors: int) -> str:
@@ -274,7 +280,7 @@ def _another_inertia(joint: _Joint, weighed: list[tuple[float, tuple[Cause, ...]
     text = f"the motion asks for {' and '.join(f'{x:.2g}' for x in factors)} times the declared inertia"
     others = [h[0] for e, h in weighed if best - e < _decisive() and len(h) == 1 and h[0].kind != "inertia"]
     motors = joint.record.motors
-    listed = " or ".join(f"{_named(one.changes, motors)} {one.what}" for one in others)
+    listed = " or ".join(_said(one.changes, one.what, motors) for one in others)
     return f"{text} (or else: {listed})" if listed else text
 
 

@@ -283,7 +283,7 @@ def test_everybody_stays_with_the_daemon_whatever_another_session_writes(
 
             until(attacked)
             assert client.rivals == int(claims) and client.daemon == str(publisher._session.zid())
-            assert all(tap.missed < 999_000 for tap in taps)
+            assert all(max(tap.missed.values()) < 999_000 for tap in taps)
             del token
     told = [message.data for message in read_messages(tmp_path / "r.mcap", frozenset({"status", "model"}))]
     assert any(b"running" in one for one in told) and not any(b"forged" in one for one in told)
@@ -304,9 +304,7 @@ def test_nothing_that_a_daemon_publishes_ends_the_monitor_the_recorder_or_a_clie
     publishers = {name: source(publisher._session, f"drivelink/elbow/{name}") for name in attacks}
     console = Console(width=80, height=24)
     with watching(endpoint, tmp_path) as (client, _, taps, poll):
-        until(
-            lambda: publish(publisher) and client.valid and poll() and all(tap._sequence >= 0 for tap in taps)
-        )
+        until(lambda: publish(publisher) and client.valid and poll() and all(tap._sequence for tap in taps))
         for name, payloads in attacks.items():
             entity, info = publishers[name]
             for payload in payloads:

@@ -227,7 +227,7 @@ def test_a_joint_that_lacked_an_effect_in_some_nights_is_not_merely_steady():
 
 def test_a_power_of_ten_on_an_axis_is_written_as_elsewhere():
     drawn = page(summarise([night("elbow", k, 4e6, []) for k in range(8)], 0.05))
-    assert ">4e6<" in drawn and "e+0" not in drawn
+    assert ">4.00e6<" in drawn and ">3.98e6<" in drawn and "e+0" not in drawn
 
 
 def test_on_a_terminal_the_sentence_of_a_joint_breaks_between_words(tmp_path, monkeypatch, capsys):
@@ -268,6 +268,13 @@ def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_cha
     assert "% of the torque (median)" in text  # also on a phone, which has no head of the table
     assert "a hollow dot a model that was not sufficient" in text
     assert text.count('class="found"') == 4 and "134 → 2.00 % of the torque" in text
+
+
+def test_a_joint_that_breaks_is_still_said_to_lack_what_it_lacked():
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), ["coulomb_friction@motor"]) for k in range(8)]
+    found = rows[-1]["sentence"]
+    rows.append(night("elbow", 8, 150.0, []) | {"status": "error", "error": "no frames"})
+    assert sentence(*rows).endswith(f"no frames. The last one that could be used says: {found}")
 
 
 def test_the_examples_of_the_documentation_read_the_table(tmp_path, monkeypatch, capsys):

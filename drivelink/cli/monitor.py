@@ -185,7 +185,13 @@ def _picture(
         "± is half the 95 % interval · drivelink monitor NAME: one joint with its curves · ? legend · q ends"
     )
     footer.stylize("dim")
-    return Group(joints_table(views, console.size.width), Text(""), *alarms, footer)
+    room = max(1, console.size.height - len(alarms) - 5)
+    shown = views if len(views) <= room else dict(sorted(views.items(), key=lambda v: v[1].well)[:room])
+    more = len(views) - len(shown)
+    rest = Text(
+        f"and {more} more: a higher terminal shows them; what needs a look comes first" if more else ""
+    )
+    return Group(joints_table(shown, console.size.width), rest, *alarms, footer)
 
 
 def _print(watcher: Watcher, end: float, args: argparse.Namespace, where: str) -> None:

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from drivelink.fleet.summary import LOOK, STATES, parameter_name, spaced
 from drivelink.output.document import Block, Document, Grid, Markup, Paragraph, Rows, Section, drawn
 from drivelink.output.document import page as draw
-from drivelink.output.numbers import number, with_interval
+from drivelink.output.numbers import number, ticks_each, with_interval
 from drivelink.plaintext import natural
 from estimator.effects import in_words
 from estimator.sample import SIGMA_95
@@ -242,15 +242,14 @@ def _axes(frame: _Frame, height: float) -> str:
     parts = []
     right = frame.left + frame.width
     ticks = MaxNLocator(8 if frame.height > 150.0 else 4, steps=[1, 2, 5, 10])
-    for value in ticks.tick_values(frame.low, frame.high):
-        if not frame.low <= value <= frame.high:
-            continue
-        y, text = frame.y(value), f"{value:.6g}".replace("e+0", "e").replace("e-0", "e−").replace("-", "−")
+    first, second, *_ = ticks.tick_values(frame.low, frame.high)
+    for value, text in ticks_each(frame.low, frame.high, second - first):
+        y = frame.y(value)
         parts.append(f'<line class="grid" x1="{frame.left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text x="{frame.left - 8}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
-    first, last = (datetime.fromtimestamp(t, UTC).date() for t in (frame.begin, frame.end))
-    parts.append(f'<text x="{frame.left}" y="{height - 5:.1f}">{first}</text>')
-    parts.append(f'<text x="{right}" y="{height - 5:.1f}" text-anchor="end">{last}</text>')
+    begin, end = (datetime.fromtimestamp(t, UTC).date() for t in (frame.begin, frame.end))
+    parts.append(f'<text x="{frame.left}" y="{height - 5:.1f}">{begin}</text>')
+    parts.append(f'<text x="{right}" y="{height - 5:.1f}" text-anchor="end">{end}</text>')
     return "".join(parts)
 
 

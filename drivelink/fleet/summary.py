@@ -225,8 +225,10 @@ def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: lis
         said.insert(
             0, f"The last {which} no stiffness, from {gone[0]['time'][:10]} on: {gone[-1]['reason']}."
         )
-        if state == "lost" and rows[-1]["status"] == "done" and rows[-1]["verdict"] not in _NO_PLACE:
-            said.append(str(rows[-1]["sentence"]))
+        last = next((row for row in reversed(rows) if row["status"] == "done"), None)
+        if state == "lost" and last is not None and last["verdict"] not in _NO_PLACE:
+            before = "" if last is rows[-1] else "The last one that could be used says: "
+            said.append(f"{before}{last['sentence']}")
     if said:
         return " ".join(said)
     if state == "unread":

@@ -20,19 +20,23 @@ from drivelink.monitor.braille import sparkline
 from drivelink.monitor.view import ESTIMATE, JointView, half_interval
 from drivelink.output.numbers import among, value_and_interval
 
+_STATE = 12  # columns, at least
+
 
 def joints_table(views: Mapping[str, JointView], width: int) -> Table:
     """Return several joints, one line each; columns that do not fit are omitted."""
     sparks = width - 100
-    columns = [("joint", 10), ("stiffness / N·m/rad", 19), ("torque / N·m", 12)]
+    columns = [("stiffness / N·m/rad", 19), ("torque / N·m", 12)]
     if width >= 80:
         columns.append(("deflection / rad", 16))
     table = Table(expand=True, box=None, pad_edge=False)
+    rest = sum(least + 2 for _, least in columns) + (sparks + 2 if sparks >= 8 else 0) + _STATE
+    table.add_column("joint", overflow="fold", min_width=10, max_width=max(10, width - 2 - rest))
     for heading, least in columns:
         table.add_column(heading, no_wrap=True, min_width=least)
     if sparks >= 8:
         table.add_column("last seconds", no_wrap=True, min_width=sparks)
-    table.add_column("state", ratio=1, overflow="fold", min_width=12)
+    table.add_column("state", ratio=1, overflow="fold", min_width=_STATE)
     for name, view in views.items():
         estimate = view.history.latest
         ink = ESTIMATE if view.live else "dim"

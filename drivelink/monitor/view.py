@@ -127,6 +127,11 @@ class JointView:
         touch = self.history.touch
         return flags(estimate.status) + ([("contact", "yellow")] if touch and touch.contact else [])
 
+    @property
+    def well(self) -> bool:
+        """Whether the newest estimate is there, current and usable."""
+        return bool(self.flags) and not any("red" in style for _, style in self.flags)
+
     def line(self) -> str:
         """Return the joint in one plain line, for pipes and logs."""
         estimate = self.history.latest

@@ -21,7 +21,7 @@ def number(value: float, digits: int = 4) -> str:
 
 def axis_ticks(low: float, high: float) -> list[tuple[float, str]]:
     """Return three to eight round places of an axis, with labels of one power of ten."""
-    return next(ticks for step in _steps(low, high) if len(ticks := _ticks(low, high, step)) >= 3)
+    return next(ticks for step in _steps(low, high) if len(ticks := ticks_each(low, high, step)) >= 3)
 
 
 def ticks_on_rows(low: float, high: float, rows: int) -> tuple[tuple[float, float], list[tuple[float, str]]]:
@@ -32,7 +32,7 @@ def ticks_on_rows(low: float, high: float, rows: int) -> tuple[tuple[float, floa
             row = step / apart
             top = math.ceil(high / row - 1e-9) * row
             bottom = top - (rows - 1) * row
-            if bottom <= low + 1e-9 * row and 3 <= len(ticks := _ticks(bottom, top, step)) <= 8:
+            if bottom <= low + 1e-9 * row and 3 <= len(ticks := ticks_each(bottom, top, step)) <= 8:
                 found.append(((bottom, top), ticks))
     return min(found[1:] or found, key=lambda axis: axis[0][1] - axis[0][0])
 
@@ -42,7 +42,8 @@ def _steps(low: float, high: float) -> list[float]:
     return [f * power for f in (0.5, 0.2, 0.1, 0.05, 0.02)]
 
 
-def _ticks(low: float, high: float, step: float) -> list[tuple[float, str]]:
+def ticks_each(low: float, high: float, step: float) -> list[tuple[float, str]]:
+    """Return the multiples of a step on an axis, with labels of one power of ten and as many decimals."""
     places = [k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
     largest, last = max(map(abs, places), default=0.0), math.floor(math.log10(step) + 1e-9)
     return [(place, _to_place(place, largest, last) if place else "0") for place in places]

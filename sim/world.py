@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,28 +188,28 @@ class World:
 
     def truth(self) -> Truth:
         """Return the true state of the joint now."""
-        state = self._state
-        elastic = self._elastic(state)
+        return self._told(self._known())
+
+    def _known(self) -> list[float]:
+        """Return time, external torque, state; acting and elastic torque and stiffness of each motor."""
+        known = [self.time_s, self._external, *self._state]
+        for amplifier, elastic in zip(self._amplifiers, self._elastic(self._state), strict=True):
+            known += amplifier.schedule[0], *elastic
+        return known
+
+    def _told(self, known: Any) -> Truth:
+        """Return what is known of an instant, or columns of it over many, as the truth."""
+        time_s, external, q, q_rate, *state = known[:8]
         motors = tuple(
-            MotorTruth(
-                state[2 + 2 * i],
-                state[3 + 2 * i],
-                amplifier.schedule[0],
-                state[0] - state[2 + 2 * i],
-                *elastic[i],
+            MotorTruth(theta, rate, torque, q - theta, *elastic)
+            for theta, rate, torque, *elastic in zip(
+                state[::2], state[1::2], known[8::3], known[9::3], known[10::3], strict=False
             )
-            for i, amplifier in enumerate(self._amplifiers)
         )
         acting = motors if self.plant.arrangement == "antagonistic" else motors[:1]
-        return Truth(
-            self.time_s,
-            state[0],
-            state[1],
-            self._external,
-            sum(motor.flexibility_torque_nm for motor in acting),
-            sum(motor.stiffness_nm_rad for motor in acting),
-            motors,
-        )
+        torque = sum(motor.flexibility_torque_nm for motor in acting)
+        stiffness = sum(motor.stiffness_nm_rad for motor in acting)
+        return Truth(time_s, q, q_rate, external, torque, stiffness, motors)
 
 
 def _start(initial_rad: Sequence[float], motors: int, rigid: bool) -> list[float]:
@@ -239,29 +239,22 @@ def record(world: World, seconds: float) -> dict[str, NDArray[np.float64]]:
     for k in range(round(seconds / world.period_s)):
         if k:
             world.advance()
-        rows.append(_row(world))
+        readings = [value for motor in range(world.motors) for value in world.drive(motor)[:3]]
+        rows.append((*world._known(), *readings, world.link_counts()))
     if not rows:
         return {}
-    values = iter(np.array(rows).T)
-    columns = {"time_s": next(values)}
-    truth = {f"truth_{name}": next(values) for name in Truth._fields[1:3]}
-    columns["external_torque_nm"] = next(values)
-    truth |= {f"truth_{name}": next(values) for name in Truth._fields[4:6]}
-    for motor, drive in enumerate(world.drives, start=1):
-        counts, rate, columns[f"motor{motor}_current_a"] = next(values), next(values), next(values)
-        columns[f"motor{motor}_position_rad"] = counts / drive.counts_per_rad
-        columns[f"motor{motor}_velocity_rad_s"] = rate * drive.direction / drive.gear_ratio
-        columns[f"motor{motor}_torque_nm"] = (
-            columns[f"motor{motor}_current_a"] * drive.joint_torque_per_ampere
-        )
-        truth |= {f"truth_motor{motor}_{name}": next(values) for name in MotorTruth._fields}
-    encoder = world.encoder
-    columns["link_position_rad"] = next(values) / encoder.counts_per_rad + encoder.zero_rad
+    known, read = np.split(np.array(rows).T, [8 + 3 * world.motors])
+    whole: Any = world._told(known)
+    columns = {"time_s": whole.time_s, "external_torque_nm": whole.external_torque_nm}
+    truth = {f"truth_{Truth._fields[i]}": whole[i] for i in (1, 2, 4, 5)}
+    for k, (drive, of_motor) in enumerate(zip(world.drives, whole.motors, strict=True)):
+        counts, rate, current = read[3 * k : 3 * k + 3]
+        columns |= {
+            f"motor{k + 1}_current_a": current,
+            f"motor{k + 1}_position_rad": counts / drive.counts_per_rad,
+            f"motor{k + 1}_velocity_rad_s": rate * drive.direction / drive.gear_ratio,
+            f"motor{k + 1}_torque_nm": current * drive.joint_torque_per_ampere,
+        }
+        truth |= {f"truth_motor{k + 1}_{name}": values for name, values in of_motor._asdict().items()}
+    columns["link_position_rad"] = read[-1] / world.encoder.counts_per_rad + world.encoder.zero_rad
     return columns | truth
-
-
-def _row(world: World) -> tuple[float, ...]:
-    """Return the truth, what each drive reads and the truth of its motor, and the link encoder's counts."""
-    *whole, motors = world.truth()
-    each = [value for motor, truth in enumerate(motors) for value in (*world.drive(motor)[:3], *truth)]
-    return (*whole, *each, world.link_counts())

@@ -47,41 +47,35 @@ def roles(joint: JointFile, base_dir: Path = Path()) -> tuple[Role, ...]:
     Raises:
         JointFileError: a motor has no drive.
     """
-    encoder = joint.link.encoder
-    encoder_node = _encoder_node(joint)
-    found: list[Role] = []
+    encoder, found = joint.link.encoder, list[Role]()
+    encoder_node = None if encoder is None else encoder.node_id
+    if encoder is not None and encoder_node is None and joint.motor[0].drive is not None:
+        encoder_node = joint.motor[0].drive.node_id
+
+    def add(node: int, motor: int | None, drive: DriveSection | None, key: str) -> None:
+        mine = encoder if node == encoder_node else None
+        eds = (drive and drive.eds) or (mine and mine.eds)
+        found.append(
+            Role(
+                node_id=node,
+                motor=motor,
+                drive=drive,
+                encoder=mine,
+                key=key,
+                eds=base_dir / eds if eds else None,
+                tpdo=(drive.tpdo if drive else ()) + (mine.tpdo if mine else ()),
+            )
+        )
+
     for number, motor in enumerate(joint.motor):
-        drive = motor.drive
-        if drive is None:
+        if motor.drive is None:
             raise JointFileError(
                 f"{joint.name}: motor[{number + 1}].drive: expected this table, it is missing: "
                 "no bus without it"
             )
-        mine = encoder if encoder is not None and encoder_node == drive.node_id else None
-        eds = drive.eds or (mine.eds if mine else None)
-        found.append(
-            Role(
-                node_id=drive.node_id,
-                motor=number,
-                drive=drive,
-                encoder=mine,
-                key=f"motor[{number + 1}].drive",
-                eds=base_dir / eds if eds else None,
-                tpdo=drive.tpdo + (mine.tpdo if mine else ()),
-            )
-        )
-    if encoder is not None and encoder_node is not None and all(role.encoder is None for role in found):
-        found.append(
-            Role(
-                node_id=encoder_node,
-                motor=None,
-                drive=None,
-                encoder=encoder,
-                key="link.encoder",
-                eds=base_dir / encoder.eds if encoder.eds else None,
-                tpdo=encoder.tpdo,
-            )
-        )
+        add(motor.drive.node_id, number, motor.drive, f"motor[{number + 1}].drive")
+    if encoder_node is not None and all(role.encoder is None for role in found):
+        add(encoder_node, None, None, "link.encoder")
     return tuple(found)
 
 
@@ -101,16 +95,6 @@ def roles_by_node(joints: Sequence[JointFile], base_dirs: Sequence[Path] | None)
                 raise BusError(f"node {role.node_id} is claimed by two joints on one bus")
             found[role.node_id] = role
     return found
-
-
-def _encoder_node(joint: JointFile) -> int | None:
-    encoder = joint.link.encoder
-    if encoder is None:
-        return None
-    if encoder.node_id is not None:
-        return encoder.node_id
-    first = joint.motor[0].drive
-    return first.node_id if first else None
 
 
 def object_address(text: str, key: str) -> tuple[int, int]:

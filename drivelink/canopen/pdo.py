@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from drivelink.canopen.layout import MappedObject, Role, Signal, TpdoLayout
 from drivelink.canopen.sdo import Program, SdoAbort, read_number
@@ -81,11 +82,13 @@ def describe(tpdos: Iterable[Tpdo]) -> str:
     return "; ".join(parts) or "no TPDO"
 
 
-def read_optional(node: int, index: int, subindex: int) -> Program[int | None]:
-    """Read an unsigned value; None if it is not available."""
+def read_optional(node: int, index: int, subindex: int, *, exactly: bool = False) -> Program[int | None]:
+    """Read an unsigned value; None if it is not available, with `exactly` only if there is no such object."""
     try:
         return (yield from read_number(node, index, subindex))
-    except SdoAbort:
+    except SdoAbort as abort:
+        if exactly and abort.code not in ABSENT:
+            raise
         return None
 
 
@@ -97,15 +100,6 @@ def read_identity(node: int) -> Program[tuple[int, int, int, int]]:
     return vendor, product, revision, (yield from read_optional(node, 0x1018, 4)) or 0
 
 
-def _read_exactly(node: int, index: int, subindex: int) -> Program[int | None]:
-    try:
-        return (yield from read_number(node, index, subindex))
-    except SdoAbort as abort:
-        if abort.code in ABSENT:
-            return None
-        raise
-
-
 def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo | None]:
     """Read one TPDO; None if it does not exist.
 
@@ -115,7 +109,7 @@ def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo 
     Raises:
         SdoAbort: `exactly`, and a read was aborted.
     """
-    read = _read_exactly if exactly else read_optional
+    read = partial(read_optional, exactly=exactly)
     communication, mapping = 0x17FF + number, 0x19FF + number
     values = {(communication, 1): (yield from read(node, communication, 1))}
     if values[communication, 1] is None:

@@ -56,7 +56,6 @@ class Traffic:
     counts: dict[int, int] = field(default_factory=dict)  # frames by identifier
     heartbeats: dict[int, str] = field(default_factory=dict)  # last NMT state by node
     error_frames: int = 0  # seen
-    fd_frames: int = 0  # CAN FD frames seen
     last: dict[int, bytes] = field(default_factory=dict)  # last data by identifier
 
     def add(self, message: can.Message) -> None:
@@ -66,7 +65,6 @@ class Traffic:
             return
         if message.is_extended_id or message.is_remote_frame:
             return
-        self.fd_frames += message.is_fd
         cob_id, data = message.arbitration_id, bytes(message.data)
         self.counts[cob_id] = self.counts.get(cob_id, 0) + 1
         self.last[cob_id] = data
@@ -103,17 +101,11 @@ def scan(bus: FrameBus, node_ids: Iterable[int] = range(1, 128)) -> tuple[list[i
     for node in node_ids:
         check_frame(0x600 + node, question)
         send(0x600 + node, question)
-        _drain(bus, traffic, _GAP_S)
-    _drain(bus, traffic, _ANSWER_S)
+        listen(bus, _GAP_S, traffic.add)
+    listen(bus, _ANSWER_S, traffic.add)
     traffic.seconds = time.monotonic() - started_s
     answered = {cob_id - 0x580 for cob_id in traffic.counts if 0x581 <= cob_id <= 0x5FF}
     return sorted(answered | set(traffic.heartbeats)), traffic
-
-
-def _drain(bus: FrameBus, traffic: Traffic, seconds: float) -> None:
-    for message in frames(bus, seconds):
-        if message is not None:
-            traffic.add(message)
 
 
 def identify(bus: FrameBus, section: BusSection, node_id: int) -> FoundNode:

@@ -80,10 +80,7 @@ class Report:
         console.print(self._closing(), highlight=False)
 
     def _closing(self) -> str:
-        counts = dict.fromkeys(Severity, 0)
-        for section in self.sections:
-            for finding in section.notices:
-                counts[finding.severity] += 1
+        counts = Counter(finding.severity for section in self.sections for finding in section.notices)
         errors, warnings = counts[Severity.ERROR], counts[Severity.WARNING]
         if errors:
             plural = "s" if errors > 1 else ""

@@ -163,7 +163,7 @@ def make(recording: Path) -> dict[str, Any]:
     first_s = next(read_messages(recording, frozenset({"sample"}))).log_time_ns * 1e-9
     runs = simulated(held, declared=model, found=apply_diagnosis.diagnosed_model(source.joint, change))
     title = report.Title(source.joint.name, recording.name, None, source.joint.axis == "linear")
-    finding.write_page(recording, report.html_page(outcome, title))
+    finding.put(finding.page_file(recording), report.html_page(outcome, title))
     sentence = f"{said.sentence} Nothing is proposed: {harmful}." if harmful else said.sentence
     return {
         **finding.begun(recording, state, sentence),

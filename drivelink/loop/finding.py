@@ -155,19 +155,15 @@ def write(recording: Path, finding: Mapping[str, Any]) -> None:
     Raises:
         RecordingError: it cannot be written.
     """
-    _put(finding_file(recording), json.dumps(finding, indent=1, allow_nan=False) + "\n")
+    put(finding_file(recording), json.dumps(finding, indent=1, allow_nan=False) + "\n")
 
 
-def write_page(recording: Path, page: str) -> None:
-    """Write the page of a diagnosis beside its recording.
+def put(path: Path, text: str) -> None:
+    """Write a text that lies beside a recording.
 
     Raises:
         RecordingError: it cannot be written.
     """
-    _put(page_file(recording), page)
-
-
-def _put(path: Path, text: str) -> None:
     try:
         write_whole(path, text, force=True)
     except OSError as error:

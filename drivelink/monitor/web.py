@@ -42,6 +42,9 @@ _DETAILS = 16  # lines of a finding
 _EVENT_S = 0.1
 _LOCAL_HOSTS = frozenset({"localhost", "127.0.0.1", "[::1]"})
 _OWN_PAGES = ("same-origin", "none")  # what a browser says of our page, and of the user's own request
+_AS_SHOWN = (
+    "nodes", "wrong", "events", "not_valid", "alarm", "advice", "residual_nm", "no_gauge", "improved"
+)  # fmt: skip
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; "
     "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -229,16 +232,8 @@ def _describe(shown: Shown) -> dict[str, Any]:
             ("cpu", shown.cpu),
             ("recording", shown.recording),
         ],
-        "nodes": shown.nodes,
-        "wrong": shown.wrong,
-        "events": shown.events,
-        "not_valid": shown.not_valid,
-        "alarm": shown.alarm,
-        "advice": shown.advice,
-        "residual_nm": shown.residual_nm,
-        "no_gauge": shown.no_gauge,
-        "balances": [(b.name, b.residual_nm, b.baseline_nm, b.ratio) for b in shown.balances],
-        "improved": shown.improved,
+        **{name: getattr(shown, name) for name in _AS_SHOWN},
+        "balances": [(*balance, balance.ratio) for balance in shown.balances],
     }
 
 

@@ -258,17 +258,17 @@ class Client:
     @property
     def status(self) -> dict[str, Any] | None:
         """The daemon's last status, or None."""
-        return self._document("status")
+        return self._message("status")  # type: ignore[no-any-return]
 
     @property
     def model(self) -> dict[str, Any] | None:
         """The model in use, or None."""
-        return self._document("model")
+        return self._message("model")  # type: ignore[no-any-return]
 
     @property
     def finding(self) -> dict[str, Any] | None:
         """What the newest diagnosis of a kept recording found, or None."""
-        return self._document("finding")
+        return self._message("finding")  # type: ignore[no-any-return]
 
     def close(self) -> None:
         """Close the session; a second time does nothing."""
@@ -285,10 +285,6 @@ class Client:
         self._drain()
         latest = self._feed.latest
         return latest is not None and bool(latest.status & bit) and not self.stale
-
-    def _document(self, name: str) -> dict[str, Any] | None:
-        document: dict[str, Any] | None = self._message(name)
-        return document
 
     def _message(self, name: str) -> Any:
         """Return the newest message of a key that the daemon wrote, or None."""

@@ -154,15 +154,9 @@ def interfaces(transmissions: int, linked: bool = False) -> tuple[str, ...]:
 def wrench(frame_id: str) -> Any:
     """Return the packer of a geometry_msgs/WrenchStamped, z the joint's axis: (s, ns, torque) to bytes."""
     template = Template().header(frame_id)
-    for _ in range(6):
-        template.number("d")
-    packing = template.packer()
-
-    def message(second: int, ns: int, torque_nm: float) -> bytes:
-        data: bytes = packing(second, ns, 0.0, 0.0, 0.0, 0.0, 0.0, torque_nm)
-        return data
-
-    return message
+    for fixed in (0, 0, 0, 0, 0, None):
+        template.number("d", fixed)
+    return template.packer()
 
 
 def _diagnostic_array(

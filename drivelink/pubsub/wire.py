@@ -27,8 +27,7 @@ _VALID, _PARTIAL = int(Status.VALID), int(Status.PARTIAL)
 _JUDGED = _VALID | Status.having("unusable")  # of these bits a usable estimate has VALID only
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(NamedTuple):
     """One number: its name with the unit in it, its type (u64, u32, f64), its meaning."""
 
     name: str
@@ -56,10 +55,10 @@ class Layout:
 
     def dtype(self, count: int = 0) -> np.dtype[np.void]:
         """Return the message as a numpy record: `np.frombuffer(payload, layout.dtype(1))`."""
-        head = [(field.name, _numpy(field)) for field in self.head]
+        head = [(field.name, f"<{_codes((field,))}") for field in self.head]
         if not self.elements:
             return np.dtype(head)
-        element = np.dtype([(field.name, _numpy(field)) for field in self.element])
+        element = np.dtype([(field.name, f"<{_codes((field,))}") for field in self.element])
         return np.dtype([*head, ("count", "u1"), (self.elements, element, (count,))])
 
     def describe(self) -> dict[str, Any]:
@@ -68,27 +67,19 @@ class Layout:
             "schema": self.schema,
             "encoding": "zenoh/serialized",
             "byte_order": "little-endian",
-            "fields": [_describe(field) for field in self.head],
+            "fields": [field._asdict() for field in self.head],
         }
         if self.elements:
             described["sequence"] = {
                 "name": self.elements,
                 "length": "LEB128 varint (one byte below 128)",
-                "fields": [_describe(field) for field in self.element],
+                "fields": [field._asdict() for field in self.element],
             }
         return described
 
 
 def _codes(fields: tuple[Field, ...]) -> str:
     return "".join(_STRUCT_CODES[field.type] for field in fields)
-
-
-def _numpy(field: Field) -> str:
-    return {"u64": "<u8", "u32": "<u4", "f64": "<f8"}[field.type]
-
-
-def _describe(field: Field) -> dict[str, str]:
-    return {"name": field.name, "type": field.type, "meaning": field.meaning}
 
 
 def _part(name: str) -> tuple[Field, ...]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +28,7 @@ _HELD = (
 _LONGEST_S = 60.0  # of a run that is examined; more adds no information
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Correction:
+class Correction(NamedTuple):
     """A corrected key of the joint file."""
 
     table: str  # e.g. "motor[1].drive" or "recording.scale".
@@ -151,7 +151,7 @@ def corrections(joint: JointFile, needed: Sequence[Change], *, live: bool) -> li
         inertia = changes.get(f"motor{number}_inertia")
         if inertia is not None:
             value = motor.inertia_kg_m2 * inertia.factor
-            found.append(_new(f"motor[{number}]", "inertia_kg_m2", value, inertia.factor))
+            found.append(Correction(f"motor[{number}]", "inertia_kg_m2", value, inertia.factor))
         if live and motor.drive is not None:
             found += _of_drive(motor.drive, f"motor[{number}].drive", position, torque)
         else:
@@ -165,10 +165,6 @@ def corrections(joint: JointFile, needed: Sequence[Change], *, live: bool) -> li
     return found
 
 
-def _new(table: str, key: str, value: float | int | None, factor: float) -> Correction:
-    return Correction(table=table, key=key, value=value, factor=factor)
-
-
 def _column(joint: JointFile, change: Change, number: int = 0) -> Correction:
     """Return a factor for a column, times the present one."""
     names = {"time": "time_s", "link_position": "link_position_rad"}
@@ -178,7 +174,7 @@ def _column(joint: JointFile, change: Change, number: int = 0) -> Correction:
     if change.channel == f"motor{number}_torque" and f"motor{number}_current_a" in scale:
         torque = f"motor{number}_current_a"
     name = names.get(change.channel, torque)
-    return _new("recording.scale", name, change.factor * scale.get(name, 1.0), change.factor)
+    return Correction("recording.scale", name, change.factor * scale.get(name, 1.0), change.factor)
 
 
 def _of_drive(
@@ -190,26 +186,26 @@ def _of_drive(
     found = []
     now = drive.torque_direction or drive.direction
     if a < 0.0:
-        found.append(_new(table, "direction", -drive.direction, -1.0))
+        found.append(Correction(table, "direction", -drive.direction, -1.0))
     if b < 0.0 or (a < 0.0 and drive.torque_direction is None):
         wanted = -now if b < 0.0 else now
         if wanted != (-drive.direction if a < 0.0 else drive.direction) or drive.torque_direction is not None:
-            found.append(_new(table, "torque_direction", wanted, b))
+            found.append(Correction(table, "torque_direction", wanted, b))
     a, b = abs(a), abs(b)
     if abs(a * b - 1.0) < 1e-9 and a != 1.0:  # both by the gear
-        return [*found, _new(table, "gear_ratio", drive.gear_ratio / a, 1.0 / a)]
+        return [*found, Correction(table, "gear_ratio", drive.gear_ratio / a, 1.0 / a)]
     if a != 1.0:
         counts = None if drive.counts_per_rev is None else drive.counts_per_rev / a
-        found.append(_new(table, "counts_per_rev", counts, 1.0 / a))
+        found.append(Correction(table, "counts_per_rev", counts, 1.0 / a))
     if b != 1.0:
         key = "rated_torque_nm" if drive.rated_torque_nm is not None else "torque_constant_nm_a"
         now_scale = getattr(drive, key)
-        found.append(_new(table, key, None if now_scale is None else now_scale * b, b))
+        found.append(Correction(table, key, None if now_scale is None else now_scale * b, b))
     return found
 
 
 def _of_link(encoder: EncoderSection, link: Change) -> Correction:
     if link.factor < 0.0:
-        return _new("link.encoder", "direction", -encoder.direction, -1.0)
+        return Correction("link.encoder", "direction", -encoder.direction, -1.0)
     counts = None if encoder.counts_per_rev is None else encoder.counts_per_rev / link.factor
-    return _new("link.encoder", "counts_per_rev", counts, 1.0 / link.factor)
+    return Correction("link.encoder", "counts_per_rev", counts, 1.0 / link.factor)

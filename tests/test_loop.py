@@ -180,7 +180,9 @@ def test_a_full_disk_is_a_line_of_the_diagnosis_too(tmp_path, monkeypatch, caplo
     for owner, name in ((os, "nice"), (os, "sched_setscheduler"), (signal, "signal")):
         monkeypatch.setattr(owner, name, lambda *_: None)
     monkeypatch.setattr(finding, "write_whole", full)
-    monkeypatch.setattr(diagnosing, "make", lambda recording: finding.put(finding.page_file(recording), "page"))
+    monkeypatch.setattr(
+        diagnosing, "make", lambda recording: finding.put(finding.page_file(recording), "page")
+    )
     assert diagnosing.main() == 3
     (said,) = [record.getMessage() for record in caplog.records]
     assert said == f"elbow: {finding_file(made)}: cannot be written: No space left on device"

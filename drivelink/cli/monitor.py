@@ -6,9 +6,10 @@ import argparse
 import json
 import sys
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
+import zenoh
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
@@ -91,13 +92,16 @@ def run(args: argparse.Namespace) -> int:
         if not args.web or args.joint is None or not _is_file(args.joint):
             raise UsageError("--allow-accept: expected --web and the joint file that may be changed")
         acceptance = WebAcceptance(Path(args.joint))
-    if args.foxglove:
-        return _foxglove(args)
+    if args.foxglove and (args.web or args.json or args.joint is None or not _is_file(args.joint)):
+        raise UsageError("--foxglove: expected a joint file, and neither --web nor --json")
     name, endpoint, config, prefix = _where(args)
     end = time.monotonic() + args.seconds if args.seconds else float("inf")
     with ExitStack() as stack:
         session = open_client(endpoint, config)
         stack.callback(close_session, session)
+        if args.foxglove:
+            _foxglove(session, args, end)
+            return 0
         watcher = Watcher(session, prefix, name)
         stack.callback(watcher.close)
         stack.enter_context(suppress(KeyboardInterrupt))
@@ -110,28 +114,18 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _foxglove(args: argparse.Namespace) -> int:
+def _foxglove(session: zenoh.Session, args: argparse.Namespace, end: float) -> None:
     """Serve a joint's messages until the end or Ctrl-C."""
     from drivelink.recording.foxglove import FoxgloveSink
-    from drivelink.recording.recorder import FirstSource, Recorder, ZenohTap
+    from drivelink.recording.recorder import Recorder, ZenohTap
 
-    if args.web or args.json or args.joint is None or not _is_file(args.joint):
-        raise UsageError("--foxglove: expected a joint file, and neither --web nor --json")
     joint = jointfile.load(Path(args.joint))
-    _, endpoint, config, _ = _where(args)
-    end = time.monotonic() + args.seconds if args.seconds else float("inf")
-    with ExitStack() as stack:
-        session = open_client(endpoint, config)
-        stack.callback(close_session, session)
-        sink = FoxgloveSink(joint, args.port)
-        recorder = stack.enter_context(Recorder(sink, []))
-        tap = ZenohTap(session, joint, sink, FirstSource(sink))
-        stack.callback(tap.close)
+    sink = FoxgloveSink(joint, args.port)
+    with Recorder(sink, []) as recorder, closing(ZenohTap(session, joint, sink)) as tap:
         recorder.taps.append(tap)
         print(f"open a connection to ws://127.0.0.1:{sink.port}   (Ctrl-C ends)", flush=True)
         with suppress(KeyboardInterrupt):
             recorder.run(lambda: time.monotonic() >= end)
-    return 0
 
 
 def _where(args: argparse.Namespace) -> tuple[str | None, str, Path | None, str]:

@@ -61,7 +61,8 @@ class Housekeeping:
             return
         if slack_ns >= _ENOUGH_NS or now_ns - task.due_ns > _PATIENCE_NS > task.due_ns - now_ns:
             task.due_ns = max(task.due_ns + task.period_ns, now_ns)
-            self._finish()
+            while self._parts is not None:  # without slack for so long that another task cannot wait
+                self._go_on(self._parts)
             try:
                 parts = task.action()
             except Exception as error:  # noqa: BLE001 - as above
@@ -80,8 +81,3 @@ class Housekeeping:
         except Exception as error:  # noqa: BLE001 - as above
             self._parts = None
             self.on_fault(error)
-
-    def _finish(self) -> None:
-        """Finish a task when there was no slack for so long that another one cannot wait."""
-        while self._parts is not None:
-            self._go_on(self._parts)

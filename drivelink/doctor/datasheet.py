@@ -46,20 +46,16 @@ def asked_signals(role: Role) -> set[Signal]:
     return asked | ({Signal.SECOND_POSITION} if role.drive.second_encoder else set())
 
 
-def _second_encoder(role: Role) -> str:
-    """Return the object where a second encoder of the motor would be: the first that is not the link's."""
-    link = "" if role.encoder is None else role.encoder.object or _ENCODERS[0]
-    return next(each for each in _ENCODERS if each.lower() != link.lower())
-
-
 def curious(role: Role) -> Role:
     """Return a role that is interested in all signals, those for cross-checks included."""
     if role.drive is None:
         return role
+    link = "" if role.encoder is None else role.encoder.object or _ENCODERS[0]
+    other = next(each for each in _ENCODERS if each.lower() != link.lower())
     update = {
         "velocity": True,
         "checks": ("current", "following_error"),
-        "second_encoder": role.drive.second_encoder or _second_encoder(role),
+        "second_encoder": role.drive.second_encoder or other,
     }
     return replace(role, drive=role.drive.model_copy(update=update))
 
@@ -136,15 +132,6 @@ def _cost(role: Role, wanted: Available, objects: Available, tpdos: Sequence[Tpd
 
 _NEEDED = {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE}  # of a drive
 _NEEDED_OF_ENCODER = {Signal.LINK_POSITION}
-_UNDECLARED = {
-    Signal.MOTOR_POSITION: "the file gives no counts per motor revolution (0x608F)",
-    Signal.MOTOR_TORQUE: "the file gives no value for rated torque (0x6076) or rated current (0x6075)",
-}
-_STATE = {
-    Signal.MOTOR_POSITION: "motor.drive: counts_per_rev, if the drive does not report it",
-    Signal.MOTOR_TORQUE: "motor.drive: rated_torque_nm, or torque_constant_nm_a and rated_current_a or "
-    "current_object, if the drive does not report it",
-}
 # Stand-ins for the units of a drive that is not there: only which objects it has is of interest.
 _ASSUMED: dict[str, Any] = {
     "counts_per_rev": 4096.0,
@@ -300,6 +287,5 @@ def _units(section: Section, sheet: DataSheet) -> None:
     drive = DriveSection(node_id=1)
     bare = Role(node_id=1, motor=0, drive=drive, encoder=None, key="motor.drive", eds=sheet.path, tpdo=())
     offered = offer(bare, sheet.values(), vendor_of(sheet.vendor_id))
-    for signal, missing in _UNDECLARED.items():
-        if signal in offered.missing:
-            section.info("units", missing, _STATE[signal])
+    for signal in sorted(_NEEDED & offered.missing.keys()):
+        section.info("units", offered.missing[signal])

@@ -224,7 +224,8 @@ def write_model(
     before = without_check(source.text)
     document = tomlkit.parse(before)
     _merge(document, changes)
-    text = _checked(_apart(tomlkit.dumps(document), before))
+    text = f"{_MARK}\n{_apart(tomlkit.dumps(document), before).rstrip()}\n"
+    text += f"# drivelink check: sha256 {_digest(text)}\n"
     joint = parse(text, str(target))
     try:
         write_whole(target, text, force=force)
@@ -241,12 +242,6 @@ def _apart(text: str, before: str) -> str:
             lines.append("")
         lines.append(line)
     return "\n".join(lines[1:])
-
-
-def _checked(text: str) -> str:
-    """Return a joint file's text with its first line and its check line."""
-    text = f"{_MARK}\n{text.rstrip()}\n"
-    return f"{text}# drivelink check: sha256 {_digest(text)}\n"
 
 
 def without_check(text: str) -> str:

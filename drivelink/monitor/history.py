@@ -129,18 +129,15 @@ class JointHistory:
             self.moments.clear()  # another joint has taken the name
             self.doubtful = ()
         self.latest = estimate
-        moments = self.moments
-        if moments:
-            since = time_s - moments[-1].time_s
-            if since < 0.0:  # the daemon restarted
-                moments.clear()
-                self.residuals.clear()
-                self.touches.clear()
-            elif since < 0.999 * self._apart_s:
-                return
-            elif since > max(_GAP_S, 3.0 * self._apart_s):
-                self._break_off(moments[-1].time_s + self._apart_s)
-        moments.append(
+        last_s = self.moments[-1].time_s if self.moments else math.nan
+        if not self._is_due(self.moments, time_s):
+            return
+        if time_s < last_s:  # the daemon restarted
+            self.residuals.clear()
+            self.touches.clear()
+        elif time_s - last_s > max(_GAP_S, 3.0 * self._apart_s):
+            self._break_off(last_s + self._apart_s)
+        self.moments.append(
             Moment(
                 time_s,
                 estimate.flexibility_torque_nm,
@@ -182,22 +179,21 @@ class JointHistory:
         self.touch = Touch(
             time_s, message.external_torque_nm, message.external_torque_std_nm, message.valid, message.contact
         )
-        last = self.touches[-1] if self.touches else None
-        if last is not None and time_s < last.time_s:  # the daemon restarted
-            self.touches.clear()
-        elif last is not None and time_s - last.time_s < 0.999 * self._apart_s:
-            begins = self.touch.contact and not last.contact
-            if not begins:
-                return
-        self.touches.append(self.touch)
+        begins = self.touch.contact and not (self.touches and self.touches[-1].contact)
+        if self._is_due(self.touches, time_s) or begins:
+            self.touches.append(self.touch)
 
     def add_sample(self, sample: Sample, time_s: float) -> None:
         """Enter what was measured at one SYNC."""
-        since = time_s - self.signals[-1][0] if self.signals else math.inf
-        if since < 0.0:  # the daemon restarted
-            self.signals.clear()
-        if since < 0.0 or since >= 0.999 * self._apart_s:
+        if self._is_due(self.signals, time_s):
             self.signals.append((time_s, sample))
+
+    def _is_due(self, kept: deque[Any], time_s: float) -> bool:
+        """Return whether a time is one to be kept; what is later is of a daemon before this one."""
+        since = time_s - kept[-1][0] if kept else math.inf
+        if since < 0.0:
+            kept.clear()
+        return since < 0.0 or since >= 0.999 * self._apart_s
 
     def add_residual(self, ratio: float) -> None:
         """Enter the present residual over its baseline."""

@@ -9,7 +9,6 @@ import sys
 import termios
 import tty
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Any, Self
 
 from rich.console import Console
@@ -76,9 +75,7 @@ class Keys:
             tty.setcbreak(self._terminal)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._before is not None:
             termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._before)
 

@@ -11,7 +11,8 @@ print(view.line())                           # the same in one plain line, where
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -278,9 +279,11 @@ class JointView:
 
     def _plots(self, width: int, height: int) -> Table:
         half = (width - 2) // 2
-        rows = [(self._curve_plot, self._torque_plot)]
+        torque = partial(self._over_time, "torque_nm", "torque over time, N·m")
+        rows: list[tuple[Callable[[int, int], Text], ...]] = [(self._curve_plot, torque)]
         if height >= _TWO_ROWS:
-            rows.append((self._stiffness_plot, self._last_plot))
+            stiffness = partial(self._over_time, "stiffness_nm_rad", "stiffness over time, N·m/rad")
+            rows.append((stiffness, self._last_plot))
         grid = Table.grid(padding=(0, 2, 0, 0))
         for left, right in rows:
             grid.add_row(left(half, height // len(rows)), right(width - 2 - half, height // len(rows)))
@@ -337,15 +340,12 @@ class JointView:
             plot.note(empty or self._why_empty())
         return plot.render(title, "s")
 
-    def _torque_plot(self, width: int, height: int) -> Text:
-        moments = [(m.time_s, m.torque_nm, m.valid) for m in self.history.window()]
-        truth = [m.true_torque_nm for m in self.history.window()]
-        return self._time_plot(width, height, "torque over time, N·m", moments, truth)
-
-    def _stiffness_plot(self, width: int, height: int) -> Text:
-        moments = [(m.time_s, m.stiffness_nm_rad, m.valid) for m in self.history.window()]
-        truth = [m.true_stiffness_nm_rad for m in self.history.window()]
-        return self._time_plot(width, height, "stiffness over time, N·m/rad", moments, truth)
+    def _over_time(self, name: str, title: str, width: int, height: int) -> Text:
+        """Plot a value of the moments, with its truth where that is known."""
+        moments = self.history.window()
+        series = [(m.time_s, getattr(m, name), m.valid) for m in moments]
+        truth = [getattr(m, f"true_{name}") for m in moments]
+        return self._time_plot(width, height, title, series, truth)
 
     def _last_plot(self, width: int, height: int) -> Text:
         """Return the external torque where the link is known, else the residual."""

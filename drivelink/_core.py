@@ -1,6 +1,6 @@
 """The service's part of the compiled core; one extension, `estimator._core`, holds both crates."""
 
-from estimator._core import (
+from estimator._core import (  # noqa: F401 - drivelink/_core.pyi has their types
     LATE,
     LATEST,
     MESSAGES,
@@ -23,27 +23,3 @@ from estimator._core import (
     encode_sample,
     json_frame,
 )
-
-__all__ = [
-    "LATE",
-    "LATEST",
-    "MESSAGES",
-    "STATUS_BITS",
-    "SYNC_COB_ID",
-    "Assembler",
-    "History",
-    "JointPipeline",
-    "JsonNumbers",
-    "LatencyHistogram",
-    "McapMessage",
-    "McapMessages",
-    "NodeCounters",
-    "SdoTransfers",
-    "SyncNumbering",
-    "Tick",
-    "__version__",
-    "encode_estimate",
-    "encode_external",
-    "encode_sample",
-    "json_frame",
-]

@@ -9,6 +9,7 @@ import difflib
 import logging
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -184,17 +185,27 @@ def record_from_columns(
         _LOG.warning("%s: ignored column(s) %s", where, some(unknown, 40))
     factors = joint.recording.scale if joint else {}
     columns = {name: x * factors[name] if name in factors else x for name, x in columns.items()}
-    motors = _motors(columns, joint, where)
-    _require(columns, "time_s", where)
+    table = _Table(columns, where, joint)
+    numbers = range(1, table.motors() + 1)
+    table.require("time_s")
     columns, grid = _on_grid(columns, where, joint.bus.period_s if joint else None)
-    columns = {name: values[grid.keep] if values.size else values for name, values in columns.items()}
-    channels = _channels(columns, motors, joint, where)
-    link = channels.link.get("link_position_rad", channels.positions[0])
-    usable = _usable([*channels.positions, *channels.torques, link], where)
+    table.columns = {name: values[grid.keep] if values.size else values for name, values in columns.items()}
+    positions = [table.needed(f"motor{i}_position_rad") for i in numbers]
+    torques = [table.torque(i) for i in numbers]
+    velocities = [table.known(f"motor{i}_velocity_rad_s") for i in numbers]
+    link = {name: values for name in OF_LINK if (values := table.known(name)) is not None}
+    if "link_position_rad" not in link and joint and joint.model().has_deflection:
+        table.needed("link_position_rad")
+    for i, position in zip(numbers, positions, strict=True):
+        if np.nanmin(position) == np.nanmax(position):
+            name = f"motor{i}_position_rad"
+            _LOG.warning("%s: %s never changes: nothing moved, or the signal is not connected", where, name)
+    usable = _usable([*positions, *torques, link.get("link_position_rad", positions[0])], where)
     rows = np.ones_like(usable) if keep_nan else usable
 
-    def stacked(arrays: list[FloatArray]) -> FloatArray:
-        return np.ascontiguousarray(np.stack(arrays, axis=1)[rows])
+    def stacked(arrays: Sequence[FloatArray | None]) -> FloatArray:
+        none = np.full(len(rows), np.nan)
+        return np.ascontiguousarray(np.stack([none if x is None else x for x in arrays], axis=1)[rows])
 
     sequence = grid.sequence[rows]
     report_gaps(sequence, grid.period_s, where)
@@ -204,11 +215,11 @@ def record_from_columns(
         return Record(
             period_s=grid.period_s,
             sequence=sequence,
-            motor_position_rad=stacked(channels.positions),
-            motor_torque_nm=stacked(channels.torques),
-            motor_velocity_rad_s=stacked(channels.velocities) if channels.velocities else None,
+            motor_position_rad=stacked(positions),
+            motor_torque_nm=stacked(torques),
+            motor_velocity_rad_s=stacked(velocities) if any(v is not None for v in velocities) else None,
             start_s=grid.start_s,
-            **{name: values[rows] for name, values in channels.link.items()},
+            **{name: values[rows] for name, values in link.items()},
         )
     except EstimatorError as error:
         raise RecordingError(f"{where}: {error}") from error
@@ -273,39 +284,63 @@ def _renumber(where: str, period_s: float) -> str:
     )
 
 
-class _Channels(NamedTuple):
-    """(rows,) each; one per motor, and what is known of the link; no velocities: none was measured."""
+@dataclass(slots=True)
+class _Table:
+    """The columns of a recording, (rows,) each; what is missing is an error with a hint."""
 
-    positions: list[FloatArray]
-    torques: list[FloatArray]
-    velocities: list[FloatArray]
-    link: dict[str, FloatArray]
+    columns: Mapping[str, FloatArray]
+    where: str
+    joint: JointFile | None
 
+    def motors(self) -> int:
+        """Return the number of motors: of the joint, or of the columns."""
+        recorded = 2 if "motor2_position_rad" in self.columns else 1
+        motors = recorded if self.joint is None else len(self.joint.motor)
+        if motors < recorded:
+            text = "%s: has a second motor, the joint file has not: its columns are ignored"
+            _LOG.warning(text, self.where)
+        return motors
 
-def _channels(
-    columns: Mapping[str, FloatArray], motors: int, joint: JointFile | None, where: str
-) -> _Channels:
-    numbers = range(1, motors + 1)
-    positions = [_needed(columns, f"motor{i}_position_rad", where) for i in numbers]
-    torques = [_torque(columns, i, joint, where) for i in numbers]
-    measured = [_optional(columns, f"motor{i}_velocity_rad_s") for i in numbers]
-    velocities = [np.full(len(positions[0]), np.nan) if v is None else v for v in measured]
-    link = {name: values for name in OF_LINK if (values := _optional(columns, name)) is not None}
-    if "link_position_rad" not in link and joint and joint.model().has_deflection:
-        _needed(columns, "link_position_rad", where)
-    for i, position in zip(numbers, positions, strict=True):
-        if np.nanmin(position) == np.nanmax(position):
-            name = f"motor{i}_position_rad"
-            _LOG.warning("%s: %s never changes: nothing moved, or the signal is not connected", where, name)
-    return _Channels(positions, torques, velocities if any(v is not None for v in measured) else [], link)
+    def known(self, name: str) -> FloatArray | None:
+        """Return a column, infinities as NaN; None if it has no finite value."""
+        values = self.columns.get(name)
+        if values is None or not np.any(np.isfinite(values)):
+            return None
+        return np.where(np.isfinite(values), values, np.nan)
 
+    def needed(self, name: str, other: str = "") -> FloatArray:
+        """Return a column that has to be there.
 
-def _optional(columns: Mapping[str, FloatArray], name: str) -> FloatArray | None:
-    """Return a column, infinities as NaN; None if it has no finite value."""
-    values = columns.get(name)
-    if values is None or not np.any(np.isfinite(values)):
-        return None
-    return np.where(np.isfinite(values), values, np.nan)
+        Raises:
+            RecordingError: it is not, or has no number.
+        """
+        self.require(name, other)
+        values = self.known(name)
+        if values is None:
+            raise RecordingError(f"{self.where}: column {name} holds no numeric value")
+        return values
+
+    def torque(self, number: int) -> FloatArray:
+        """Return a motor's joint-side torque: as recorded, or current * torque constant * gear ratio."""
+        torque, current = f"motor{number}_torque_nm", f"motor{number}_current_a"
+        if torque in self.columns or current not in self.columns:
+            return self.needed(torque, f" (or {current})")
+        amperes = self.needed(current)
+        drive = self.joint.motor[number - 1].drive if self.joint else None
+        if drive is None or drive.torque_constant_nm_a is None:
+            raise RecordingError(
+                f"{self.where}: {current} needs motor[{number}].drive.torque_constant_nm_a (and gear_ratio) "
+                "in the joint file to become a torque"
+            )
+        return amperes * (drive.torque_constant_nm_a * drive.gear_ratio)
+
+    def require(self, name: str, other: str = "") -> None:
+        """Require a column, with values or not."""
+        if name not in self.columns:
+            near = difflib.get_close_matches(name, set(self.columns) - COLUMNS, n=1, cutoff=0.75)
+            hint = f"; did you mean it by {near[0]}?" if near else ""
+            found = some(self.columns, 40) or "none"
+            raise RecordingError(f"{self.where}: expected a column {name}{other}, found {found}{hint}")
 
 
 def _usable(needed: Sequence[FloatArray], where: str) -> NDArray[np.bool_]:
@@ -328,44 +363,3 @@ def _repeats(columns: Mapping[str, FloatArray]) -> NDArray[np.bool_]:
     if len(same) > 1 and np.any(np.diff(columns["time_s"]) == 0.0):
         same[1:] = np.all([v[1:] == v[:-1] for name, v in columns.items() if name in COLUMNS], axis=0)
     return same
-
-
-def _motors(columns: Mapping[str, FloatArray], joint: JointFile | None, where: str) -> int:
-    recorded = 2 if "motor2_position_rad" in columns else 1
-    motors = recorded if joint is None else len(joint.motor)
-    if motors < recorded:
-        _LOG.warning("%s: has a second motor, the joint file has not: its columns are ignored", where)
-    return motors
-
-
-def _torque(
-    columns: Mapping[str, FloatArray], number: int, joint: JointFile | None, where: str
-) -> FloatArray:
-    """(rows,) joint-side torque of a motor: as recorded, or current * torque constant * gear ratio."""
-    torque, current = f"motor{number}_torque_nm", f"motor{number}_current_a"
-    if torque in columns or current not in columns:
-        return _needed(columns, torque, where, f" (or {current})")
-    amperes = _needed(columns, current, where)
-    drive = joint.motor[number - 1].drive if joint else None
-    if drive is None or drive.torque_constant_nm_a is None:
-        raise RecordingError(
-            f"{where}: {current} needs motor[{number}].drive.torque_constant_nm_a (and gear_ratio) "
-            "in the joint file to become a torque"
-        )
-    return amperes * (drive.torque_constant_nm_a * drive.gear_ratio)
-
-
-def _needed(columns: Mapping[str, FloatArray], name: str, where: str, other: str = "") -> FloatArray:
-    _require(columns, name, where, other)
-    values = _optional(columns, name)
-    if values is None:
-        raise RecordingError(f"{where}: column {name} holds no numeric value")
-    return values
-
-
-def _require(columns: Mapping[str, FloatArray], name: str, where: str, other: str = "") -> None:
-    if name not in columns:
-        near = difflib.get_close_matches(name, set(columns) - COLUMNS, n=1, cutoff=0.75)
-        hint = f"; did you mean it by {near[0]}?" if near else ""
-        found = some(columns, 40) or "none"
-        raise RecordingError(f"{where}: expected a column {name}{other}, found {found}{hint}")

@@ -198,7 +198,7 @@ def test_long_work_on_a_terminal_is_a_bar_that_goes_away_also_where_it_breaks_of
     shown = console(terminal=True)
     with pytest.raises(KeyboardInterrupt), Meter("fit", 100, shown) as meter:
         clock.now_s += 3.0
-        meter.advance(40)
+        meter.update(40)
         raise KeyboardInterrupt
     assert "fit" in text(shown) and "40/100" in text(shown)
     assert text(shown).rstrip().endswith("\x1b[2K")  # the line is erased

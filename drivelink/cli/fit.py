@@ -57,12 +57,6 @@ def run(args: argparse.Namespace) -> int:
         if target is not None:
             check_target(target, inputs, force=True, makes_folder=True)
     joint_of(args.recording[0], args.joint)
-    _fit(args, folder)
-    return 0
-
-
-def _fit(args: argparse.Namespace, folder: Path | None) -> None:
-    """Fit, print, and write the requested files, plots into `folder`."""
     from drivelink import analysis  # takes a second; the arguments are checked
 
     options = {"bandwidth_hz": args.bandwidth_hz, "names": args.map, "strict": args.strict}
@@ -80,3 +74,4 @@ def _fit(args: argparse.Namespace, folder: Path | None) -> None:
     if args.write is not None:
         written.append(made.write(args.write, force=args.force))
     wrote(args.json, written)
+    return 0

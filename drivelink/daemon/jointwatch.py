@@ -83,16 +83,15 @@ class JointWatch:
 
     def check(self, loop_joint: LoopJoint) -> None:
         """Check for changes since the last call."""
-        self._check_fault(loop_joint)
-        self._check_model(loop_joint)
-        self._check_contradiction(loop_joint)
-        self._check_readings(loop_joint)
-
-    def _check_fault(self, loop_joint: LoopJoint) -> None:
         name, fault = loop_joint.name, loop_joint.fault
         text = f"{name}: no estimates since {fault}; rewrite its joint file or restart the daemon"
         over = f"{name}: estimates restart"
         self._events.keep(f"joint {name}", bool(fault), text, over, logging.ERROR)
+        self._check_model(loop_joint)
+        found = self._contradiction(loop_joint)
+        text, over = f"{name}: {found and found['text']}", f"{name}: no reading contradicts another"
+        self._events.keep(f"contradiction {name}", found is not None, text, over)
+        self._check_readings(loop_joint)
 
     def _check_model(self, loop_joint: LoopJoint) -> None:
         """Report begin and end of the model alarm, its amount and what to do."""
@@ -114,14 +113,6 @@ class JointWatch:
         else:
             self._alarmed.discard(loop_joint.name)
             self._events.report(f"{loop_joint.name}: the model alarm is over")
-
-    def _check_contradiction(self, loop_joint: LoopJoint) -> None:
-        """Report begin and end of a contradiction between readings."""
-        key, found = f"contradiction {loop_joint.name}", self._contradiction(loop_joint)
-        if found is None:
-            self._events.end(key, f"{loop_joint.name}: no reading contradicts another")
-        else:
-            self._events.begin(key, f"{loop_joint.name}: {found['text']}")
 
     def _check_readings(self, loop_joint: LoopJoint) -> None:
         """Report begin and end of a suspicion against a reading."""
@@ -244,7 +235,9 @@ class WatchedNode:
     def check(self, events: EventLog, now: int) -> None:
         """Report changes of heartbeat, fault and statusword since the last call, at a time in ns."""
         self._check_heartbeat(events, now)
-        self._check_faults(events)
+        node = self.layout.node_id
+        faulted, text = node in self.assembler.faults, f"node {node} reports a fault"
+        events.keep(f"fault {node}", faulted, text, f"node {node} reports no fault")
         self._check_statusword(events)
 
     def _check_heartbeat(self, events: EventLog, now: int) -> None:
@@ -255,12 +248,6 @@ class WatchedNode:
         events.keep(
             f"heartbeat {node}", lost, f"node {node}: heartbeat lost", f"node {node}: heartbeat is back"
         )
-
-    def _check_faults(self, events: EventLog) -> None:
-        node = self.layout.node_id
-        faulted = node in self.assembler.faults
-        text = f"node {node} reports a fault"
-        events.keep(f"fault {node}", faulted, text, f"node {node} reports no fault")
 
     def _check_statusword(self, events: EventLog) -> None:
         """Report when a drive leaves operation enabled, or limits its set-point."""

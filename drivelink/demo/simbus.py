@@ -102,7 +102,9 @@ class SocketcandServer(can.BusABC):
     # The clients
 
     def _serve(self, timeout: float | None) -> None:
-        for key, events in self._selector.select(self._patience(timeout)):
+        if timeout is not None and any(client.pending for client in self._clients):
+            timeout = min(timeout, _SETTLE_S)
+        for key, events in self._selector.select(timeout):
             client = key.data
             if client is None:
                 self._accept()
@@ -111,17 +113,9 @@ class SocketcandServer(can.BusABC):
                 self._read(client)
             if events & selectors.EVENT_WRITE and client in self._clients:
                 self._flush(client)
-        self._release()
-
-    def _patience(self, timeout: float | None) -> float | None:
-        held = any(client.pending for client in self._clients)
-        return min(timeout, _SETTLE_S) if held and timeout is not None else timeout
-
-    def _release(self) -> None:
-        """Send the frames held back after a greeting."""
         now_s = time.monotonic()
         for client in list(self._clients):
-            if client.pending and now_s >= client.hold_until_s:
+            if client.pending and now_s >= client.hold_until_s:  # held back after a greeting
                 waiting, client.pending = b"".join(client.pending), []
                 self._write(client, waiting)
 

@@ -278,12 +278,10 @@ def _profile(joint: JointFile, quirks: str | None) -> Quirks:
         raise JointFileError(f"{joint.name}: sim.{error}") from error
 
 
-def network_from_joint(
-    joint: JointFile, bus: can.BusABC, *, world: World | None = None, quirks: str | None = None
-) -> Network:
+def network_from_joint(joint: JointFile, bus: can.BusABC, *, world: World | None = None) -> Network:
     """Return the devices of one joint on a bus, in lockstep (`poll`) or served (`start`)."""
     world = world or world_from_joint(joint)
-    return Network(bus, nodes_from_joint(joint, world, quirks=quirks), world)
+    return Network(bus, nodes_from_joint(joint, world), world)
 
 
 def bench_from_joints(

@@ -29,14 +29,12 @@ class WebDay:
         """Return type and content, or file, of what a request asks for; None: there is no such thing."""
         asked = urlsplit(path).path
         if asked == "/day":
-            return "text/html; charset=utf-8", self._page()
+            text = files("drivelink.monitor").joinpath("day.html").read_text(encoding="utf-8")
+            page = text.replace("{{joint}}", html.escape(self._joint))
+            return "text/html; charset=utf-8", page.encode()
         if asked == "/day.json":
             return "application/json", self._data(path)
         return self._file(asked) if asked.startswith("/kept/") else None
-
-    def _page(self) -> bytes:
-        text = files("drivelink.monitor").joinpath("day.html").read_text(encoding="utf-8")
-        return text.replace("{{joint}}", html.escape(self._joint)).encode()
 
     def _data(self, path: str) -> bytes:
         """Rows and events as JSON: `?begin=&end=` in UNIX seconds, else the last day."""

@@ -78,12 +78,12 @@ def blank(width: float, height: float) -> Figure:
 
 
 def new_figure(
-    title: str = "", rows: int = 1, columns: int = 1, width: float = 7.0, height: float = 2.6
+    title: str = "", rows: int = 1, width: float = 7.0, height: float = 2.6
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure in the house style, and its axes row by row; `height` in inches is that of one row."""
+    """Return a figure in the house style, and the axes of its rows; `height` in inches is that of one row."""
     figure = blank(width, height * rows)
     with rc_context(STYLE):
-        axes = [figure.add_subplot(rows, columns, k + 1) for k in range(rows * columns)]
+        axes = [figure.add_subplot(rows, 1, k + 1) for k in range(rows)]
         if title:
             figure.suptitle(title, fontsize=11, x=0.01, ha="left", fontweight="bold")
     return figure, axes

@@ -50,11 +50,7 @@ class Meter:
     def stage(self, text: str) -> None:
         """Count one step more, and name what is being done now: "bandwidth"."""
         self._stage = text
-        self.advance()
-
-    def advance(self, items: int = 1) -> None:
-        """Count so many items more as done."""
-        self.update(self.done + items)
+        self.update(self.done + 1)
 
     def update(self, done: int) -> None:
         """Set the number of items done in all."""

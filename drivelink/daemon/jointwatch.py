@@ -89,7 +89,8 @@ class JointWatch:
         self._events.keep(f"joint {name}", bool(fault), text, over, logging.ERROR)
         self._check_model(loop_joint)
         found = self._contradiction(loop_joint)
-        text, over = f"{name}: {found and found['text']}", f"{name}: no reading contradicts another"
+        text = f"{name}: {found['text']}" if found is not None else ""
+        over = f"{name}: no reading contradicts another"
         self._events.keep(f"contradiction {name}", found is not None, text, over)
         self._check_readings(loop_joint)
 

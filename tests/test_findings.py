@@ -186,12 +186,6 @@ def test_no_stiffness_is_fitted_where_the_balance_leaves_more_than_the_spring_ca
     assert fit(record, kit.model(linked=False))[0].parameters
 
 
-@pytest.mark.slow
-def test_a_second_healthy_recording_has_no_finding():
-    first, second = (kit.World([{}], seed=seed).run()[0] for seed in (31, 32))
-    assert diagnose(second, identify(first, kit.model()).model).verdict == "sufficient"
-
-
 def test_a_healthy_spring_that_is_bent_to_one_side_has_no_offset():
     """There a constant torque, a zero and the spring make up for each other; only held-out data tell which is needed."""
     _, record = joints.pulled(*joints.polynomial(np.array([[[150.0, 1500.0]]])), 9.0, 16000)

@@ -90,9 +90,8 @@ def model(link=LINK, **transmission):
 
 
 def samples(rows, measured=False):
-    names = ("motor1_position_rad", "motor1_torque_nm", "link_position_rad", "external_torque_nm")
-    for k, (theta, tau, q, external) in enumerate(zip(*(rows[n].tolist() for n in names), strict=True)):
-        yield Sample(k, (theta,), (math.nan,), (tau,), q, math.nan, external if measured else math.nan)
+    record = joints.of_world(rows, period_s=T)
+    return replace(record, external_torque_nm=rows["external_torque_nm"] if measured else None).samples()
 
 
 class Estimates:

@@ -14,6 +14,7 @@ import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
 
+import joints
 import numpy as np
 import pytest
 import zenohkit
@@ -35,7 +36,6 @@ from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.ros2 import Ros2Publisher
 from drivelink.recording.sinks import McapSink
 from estimator.reasons import percent
-from estimator.sample import Sample
 from sim.world import record
 
 ELBOW = Path(__file__).parent.parent / "examples" / "elbow.toml"
@@ -58,11 +58,8 @@ def recorded(folder: Path, effects: tuple[str, ...] = (), name: str = NAME, **pa
     columns.append(record(world, AFTER_S))
     joined = {key: np.concatenate([part[key] for part in columns]) for key in columns[0]}
     sink = McapSink(made, source.joint, source.text)
-    keys = ("motor1_position_rad", "motor1_velocity_rad_s", "motor1_torque_nm", "link_position_rad")
-    for k, (theta, velocity, torque, q) in enumerate(
-        zip(*(joined[key].tolist() for key in keys), strict=True)
-    ):
-        sink.sample(Sample(k, (theta,), (velocity,), (torque,), q), STAMP_NS + k * 1_000_000)
+    for sample in joints.of_world(joined).samples():
+        sink.sample(sample, STAMP_NS + sample.sequence * 1_000_000)
     sink.close()
     return made
 

@@ -38,14 +38,10 @@ def monitor(fitted):
 
 
 def _play(monitor, record, first=0, external_nm=math.nan):
-    assert record.link_position_rad is not None
-    alarms = []
-    for k in range(len(record)):
-        theta, tau = record.motor_position_rad[k, 0], record.motor_torque_nm[k, 0]
-        q = float(record.link_position_rad[k])
-        sample = Sample(first + k, (theta,), (math.nan,), (tau,), q, math.nan, external_nm)
-        alarms.append(monitor.step(sample, NOTHING, 0.0))
-    return alarms
+    samples = (
+        s._replace(sequence=first + s.sequence, external_torque_nm=external_nm) for s in record.samples()
+    )
+    return [monitor.step(sample, NOTHING, 0.0) for sample in samples]
 
 
 def test_no_alarm_while_the_model_is_sufficient_and_samples_are_bad(runs, monitor):

@@ -28,7 +28,6 @@ from sim.world import record
 
 ELBOW = Path(__file__).parent.parent / "examples" / "elbow.toml"
 SOFTER = {"motor1_coefficient1_nm_rad": 108.0, "motor1_coefficient2_nm_rad": 360.0}
-COLUMNS = ("time_s", "motor1_position_rad", "motor1_velocity_rad_s", "motor1_torque_nm", "link_position_rad")
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +38,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, (effects, parameters) in kinds.items():
         world = world_from_joint(jointfile.load(ELBOW))
         alter(world, effects, parameters)
-        columns = record(world, 3.0)
-        rows = np.column_stack([columns[column] for column in COLUMNS])
-        np.savetxt(folder / f"{name}.csv", rows, "%.17g", ",", header=",".join(COLUMNS), comments="")
+        joints.write_csv(joints.of_world(record(world, 3.0)), folder / f"{name}.csv")
     return folder
 
 

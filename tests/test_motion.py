@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import joints
 import numpy as np
 import pytest
 
@@ -19,7 +20,6 @@ from estimator.model import Effect
 from sim.world import record
 
 ELBOW = Path(__file__).parent.parent / "examples" / "elbow.toml"
-COLUMNS = ("time_s", "motor1_position_rad", "motor1_torque_nm", "link_position_rad")
 MOTION = (
     "[motion]\nposition_rad = [-0.6, 0.6]\nvelocity_rad_s = 3\nacceleration_rad_s2 = 30\ntorque_nm = 12\n"
 )
@@ -40,10 +40,7 @@ def written(folder, excitation, name="run.csv", seconds=8.0, effect="backlash=0.
     joint.write_text(text.replace('{ kind = "rich" }', excitation) + "\n" + MOTION)
     world = world_from_joint(jointfile.load(joint), file=joint)
     alter(world, [effect], {})
-    columns = record(world, seconds)
-    rows = np.column_stack([columns[column] for column in COLUMNS])
-    np.savetxt(folder / name, rows, "%.9g", ",", header=",".join(COLUMNS), comments="")
-    return joint, folder / name
+    return joint, joints.write_csv(joints.of_world(record(world, seconds)), folder / name, digits=9)
 
 
 def test_random_motions_begin_and_end_at_rest_and_touch_a_limit():

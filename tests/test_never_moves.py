@@ -11,7 +11,6 @@ from can.interfaces.virtual import VirtualBus
 from daemonkit import Listener, listens, quiet_daemon, rig, running, served, vsa, vsa_text
 from zenohkit import until
 
-from drivelink.cycle.sources import VirtualSource
 from drivelink.daemon.service import Daemon
 from drivelink.jointfile import parse
 
@@ -88,18 +87,13 @@ def test_through_boot_run_reboot_and_configuration_no_frame_could_move_a_drive(p
 
 def test_a_passive_daemon_puts_no_frame_on_the_bus_whatever_happens(monkeypatch):
     senders: list[tuple[object, int]] = []
-    by_bus, by_source = VirtualBus.send, VirtualSource.send
+    by_bus = VirtualBus.send
 
     def bus_send(self, msg, timeout=None):
         senders.append((self, msg.arbitration_id))
         by_bus(self, msg, timeout)
 
-    def source_send(self, cob_id, data):
-        senders.append((self._bus, cob_id))
-        by_source(self, cob_id, data)
-
     monkeypatch.setattr(VirtualBus, "send", bus_send)
-    monkeypatch.setattr(VirtualSource, "send", source_send)
     joint = vsa(bus="period_s = 0.005")
     bus = 'period_s = 0.005\nsync = "follow"\nconfigure = false'
     guest = vsa(name="guest", channel=joint.bus.channel, bus=bus)

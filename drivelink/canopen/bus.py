@@ -64,11 +64,9 @@ def open_bus(section: BusSection) -> can.BusABC:
     if section.interface == "socketcand":
         _check_socketcand(section)
     try:
-        with _quiet(), _connecting(section):
+        with _connecting(section):
             bus = can.Bus(ignore_config=True, **_arguments(section))
-    except can.CanError as error:
-        raise BusError(f"{where} cannot be opened: {_reason(error)}") from error
-    except OSError as error:
+    except (can.CanError, OSError) as error:
         raise BusError(f"{where} cannot be opened: {_reason(error)}") from error
     except (TypeError, ValueError, KeyError, ImportError) as error:
         raise BusError(f"{where} cannot be opened, check bus.channel and bus.options: {error}") from error
@@ -232,18 +230,6 @@ def _reason(error: BaseException) -> str:
 def one_line(text: str) -> str:
     """Return a message in one line; some of python-can's contain a traceback."""
     return " ".join(text.partition("Traceback (most recent call last)")[0].split())
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """python-can also logs what it raises."""
-    log = logging.getLogger("can")
-    before = log.level
-    log.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        log.setLevel(before)
 
 
 T = TypeVar("T")

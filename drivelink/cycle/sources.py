@@ -1,20 +1,17 @@
 """The loop's interface to a bus: wait, take received frames, send. The seam to hardware is `can.Bus`.
 
 python-can makes a Message of every frame, which costs more than the whole cycle. Therefore the socket of
-SocketCAN (with the kernel's stamps) and the queue of the virtual bus are read directly; other interfaces
-through `recv`.
+SocketCAN is read directly (with the kernel's stamps); other interfaces through `recv`.
 """
 
 from __future__ import annotations
 
 import errno
-import queue
 import select
 import socket
 import struct
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -65,11 +62,6 @@ class FrameSource:
         self.lost_sends = 0  # frames that could not be sent because the transmit queue was full
         self.errors: dict[str, int] = {}  # error frames, by kind
 
-    @property
-    def waiting(self) -> bool:
-        """Whether a frame is known to be there."""
-        return False
-
     def wait(self, timeout_s: float) -> bool:
         """Wait for a frame; return whether there is one."""
         time.sleep(max(timeout_s, 0.0))
@@ -106,11 +98,6 @@ class BusSource(FrameSource):
         super().__init__()
         self._bus = bus
         self._waiting: list[can.Message] = []
-
-    @property
-    def waiting(self) -> bool:
-        """See FrameSource."""
-        return bool(self._waiting)
 
     def wait(self, timeout_s: float) -> bool:
         """See FrameSource."""
@@ -158,53 +145,6 @@ class BusSource(FrameSource):
             raise BusLostError(str(error) or type(error).__name__) from error
 
 
-class VirtualSource(BusSource):
-    """python-can's virtual bus, by its queue."""
-
-    def __init__(self, bus: Any) -> None:
-        super().__init__(bus)
-        self._queue: queue.Queue[can.Message] = bus.queue
-        # The virtual bus has no other way to know.
-        self._is_open: Callable[[], bool] = lambda: bool(bus._open)
-        self._channel: list[queue.Queue[can.Message]] = bus.channel  # of all buses on it
-        self._channel_id = bus.channel_id
-        self._pending: deque[can.Message] = bus.queue.queue  # its popleft is atomic, and needs no lock
-
-    @property
-    def waiting(self) -> bool:
-        """See FrameSource."""
-        return bool(self._pending or self._waiting)
-
-    def _receive(self, timeout_s: float) -> can.Message | None:
-        self._check()
-        if self._pending:
-            return self._pending.popleft()
-        try:
-            return self._queue.get(timeout=timeout_s) if timeout_s > 0 else None
-        except queue.Empty:
-            return None
-
-    def send(self, cob_id: int, data: bytes) -> None:
-        """Send every other bus of the channel its own message: python-can would deep-copy."""
-        self._check()
-        stamp_s = time.time()
-        for receiver in self._channel:
-            if receiver is not self._queue:
-                receiver.put(
-                    can.Message(
-                        timestamp=stamp_s,
-                        arbitration_id=cob_id,
-                        data=data,
-                        channel=self._channel_id,
-                        is_extended_id=False,
-                    )
-                )
-
-    def _check(self) -> None:
-        if not self._is_open():
-            raise BusLostError("the virtual bus is closed")
-
-
 class Pumped(FrameSource):
     """A bus with simulated devices in this thread, which answer immediately.
 
@@ -220,8 +160,7 @@ class Pumped(FrameSource):
 
     def receive(self) -> list[CanFrame]:
         """See FrameSource."""
-        if not self._source.waiting:
-            self._devices()
+        self._devices()
         return self._source.receive()
 
     def send(self, cob_id: int, data: bytes) -> None:
@@ -334,7 +273,6 @@ class SocketcandSource(BusSource):
 _FASTER: dict[str, Callable[[Any], FrameSource]] = {
     "SocketcanBus": SocketCanSource,
     "SocketCanDaemonBus": SocketcandSource,
-    "VirtualBus": VirtualSource,
 }
 
 

@@ -148,21 +148,24 @@ class Comparison:
 
     def _differences(self) -> Grid:
         rows: Rows = []
-        for one in self.differences():
-            unit = self.units.shown("(N·m/rad)" if one.kind == "stiffness" else "N·m")
-            apart = f"{abs(one.b - one.a) / one.std:.1f} σ" if one.std > 0.0 else "–"
-            at = f"{number(one.at, 3)} {self.units.shown('rad' if one.kind == 'stiffness' else 'rad/s')}"
-            a, b = (value_and_interval(value, SIGMA_95 * one.std)[0] for value in (one.a, one.b))
-            if (f"motor {one.motor}",) not in rows:
-                rows.append((f"motor {one.motor}",))
-            rows.append((f"{one.kind} / {unit}", a, b, at, apart))
+        found = {(one.motor, one.kind): one for one in self.differences()}
         for motor in range(len(self.sides[0].model.motors)):
-            known = [letter for letter, _ in self.curves(motor)["stiffness"]]
-            if len(known) < 2 and all(side.model.motors[motor].flexible for side in self.sides):
+            rows.append((f"motor {motor + 1}",))
+            flexible = all(side.model.motors[motor].flexible for side in self.sides)
+            if flexible and (motor + 1, "stiffness") not in found:
+                known = [letter for letter, _ in self.curves(motor)["stiffness"]]
                 each = ["known" if letter in known else "not known" for letter in "AB"]
-                rows += [(f"motor {motor + 1}",)] if (f"motor {motor + 1}",) not in rows else []
-                rows.insert(rows.index((f"motor {motor + 1}",)) + 1, ("stiffness", *each, "", ""))
+                rows.append(("stiffness", *each, "", ""))
+            kinds = ("stiffness", "friction")
+            rows += [self._row(found[motor + 1, kind]) for kind in kinds if (motor + 1, kind) in found]
         return Grid(("", "A", "B", "at", "apart"), rows)
+
+    def _row(self, one: Difference) -> tuple[str, ...]:
+        unit = self.units.shown("(N·m/rad)" if one.kind == "stiffness" else "N·m")
+        apart = f"{abs(one.b - one.a) / one.std:.1f} σ" if one.std > 0.0 else "–"
+        at = f"{number(one.at, 3)} {self.units.shown('rad' if one.kind == 'stiffness' else 'rad/s')}"
+        a, b = (value_and_interval(value, SIGMA_95 * one.std)[0] for value in (one.a, one.b))
+        return (f"{one.kind} / {unit}", a, b, at, apart)
 
     def _over(self, side: Side, runs: Sequence[FreeRun]) -> Figure:
         run, j = runs[0], self.channel(runs[0])

@@ -23,23 +23,18 @@ from drivelink.pubsub.session import Stream, one_line
 from drivelink.pubsub.wire import EXTERNAL_COLUMNS
 from estimator.sample import Estimate, External, ExternalStatus, Status
 
-TYPE_HASHES = {
-    "sensor_msgs::msg::dds_::JointState_": (
-        "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
+_TYPES = (  # package, message, and the hash of its definition
+    ("sensor_msgs", "JointState", "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"),
+    ("std_msgs", "Float64MultiArray", "1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f"),
+    ("control_msgs", "DynamicJointState", "18024c98a62697680f581108eeed40b28fb4542fa0ac5a8e36f56c62b6813d26"),
+    (
+        "diagnostic_msgs",
+        "DiagnosticArray",
+        "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     ),
-    "std_msgs::msg::dds_::Float64MultiArray_": (
-        "RIHS01_1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f"
-    ),
-    "control_msgs::msg::dds_::DynamicJointState_": (
-        "RIHS01_18024c98a62697680f581108eeed40b28fb4542fa0ac5a8e36f56c62b6813d26"
-    ),
-    "diagnostic_msgs::msg::dds_::DiagnosticArray_": (
-        "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
-    ),
-    "geometry_msgs::msg::dds_::WrenchStamped_": (
-        "RIHS01_8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77"
-    ),
-}
+    ("geometry_msgs", "WrenchStamped", "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77"),
+)
+TYPE_HASHES = {f"{package}::msg::dds_::{name}_": f"RIHS01_{digest}" for package, name, digest in _TYPES}
 _HUMBLE_HASH = "TypeHashNotSupported"
 _QOS = "::,10:,:,:,,"  # reliable, volatile, keep last 10
 _ENCAPSULATION = b"\x00\x01\x00\x00"  # XCDR1, little-endian; alignment counts after it

@@ -249,3 +249,14 @@ def test_bash_completes_verbs_options_and_choices(tmp_path, capsys):
     assert set(cli.VERBS) <= complete(script, ["drivelink", ""])
     assert "--publish" in complete(script, ["drivelink", "replay", "--"])
     assert complete(script, ["drivelink", "demo", "--case", ""]) >= {"constant", "quadratic", "vsa-ii"}
+
+
+@pytest.mark.parametrize("arguments", [["new", "-", "--case", "constant"], ["completion", "bash"]])
+def test_output_that_cannot_be_written_is_one_line_and_a_failure(arguments):
+    run = "import sys; from drivelink.cli import main; sys.exit(main(sys.argv[1:]))"
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", run, *arguments], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert done.returncode == 1 and done.stderr.count("\n") == 1, done
+    assert "No space left on device" in done.stderr

@@ -126,9 +126,26 @@ def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit status."""
     try:
-        return _main(argv)
+        status = _main(argv)
     except KeyboardInterrupt:  # also while an error is being said
-        return _INTERRUPTED
+        status = _INTERRUPTED
+    except SystemExit:  # of --help
+        if not _written(0):
+            return 1
+        raise
+    return status if _written(status) else 1
+
+
+def _written(status: int) -> bool:
+    """Return whether all output has been written; say so if not, where that has not ended the verb yet."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if status == 0 and not isinstance(error, BrokenPipeError):
+            _fail("", f"standard output: {error.strerror}", 1)
+        return False
+    return True
 
 
 def _main(argv: list[str] | None) -> int:

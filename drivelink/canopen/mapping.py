@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, NoReturn
 
 from drivelink.canopen.layout import MappedObject, Role, Signal, TpdoLayout
 from drivelink.canopen.pdo import (
@@ -189,16 +190,21 @@ class Mapper:
             SdoAbort: it is off, and that cannot be changed.
         """
         if objects is not None and not tpdo.fixed:
-            self._replace(replace(tpdo, fixed=True))
-            self._refuse("is fixed", tpdo, abort)
-            raise _MapFixed from abort
+            self._learn(tpdo, "is fixed", abort, fixed=True)
         if not tpdo.enabled:
             raise abort
 
-    def _refuse(self, what: str, tpdo: Tpdo, abort: SdoAbort) -> None:
+    def _learn(self, tpdo: Tpdo, what: str, abort: SdoAbort, **known: Any) -> NoReturn:
+        """Note what a TPDO's mapping does not allow.
+
+        Raises:
+            _MapFixed: always: the signals are to be assigned anew.
+        """
+        self._replace(replace(tpdo, **known))
         answer = f"0x{abort.index:04X}:{abort.subindex:02X} answers {abort_text(abort.code)}"
         self.findings.info(self.role.subject, f"TPDO{tpdo.number} {what} ({answer})")
         self._refusal = self._refusal or f"; writing {answer}"
+        raise _MapFixed from abort
 
     def _timing(self, tpdo: Tpdo) -> Program[None]:
         """Set transmission at every SYNC, without inhibit time or event timer. A TPDO that cannot be
@@ -236,7 +242,7 @@ class Mapper:
         try:
             yield from self._put(tpdo.mapping, 0, 0, 1)
         except SdoAbort as abort:
-            self._mark_fixed(tpdo, abort)
+            self._learn(tpdo, "has a fixed map", abort, fixed=True)
         for position, candidate in enumerate(objects, start=1):
             index, subindex = candidate.address
             value = index << 16 | subindex << 8 | candidate.bits
@@ -244,16 +250,16 @@ class Mapper:
                 yield from self._put(tpdo.mapping, position, value, 4)
             except SdoAbort as abort:
                 if abort.code in _READ_ONLY:
-                    self._mark_fixed(tpdo, abort)
+                    self._learn(tpdo, "has a fixed map", abort, fixed=True)
                 if position > 1 and (yield from self._is_full(tpdo, position, abort)):
-                    self._limit(tpdo, position - 1, abort)
+                    self._learn(tpdo, _takes(position - 1), abort, most=position - 1)
                 raise _ObjectRefused(candidate, abort.code) from abort
         try:
             yield from self._put(tpdo.mapping, 0, len(objects), 1)
         except SdoAbort as abort:
             if abort.code == _TOO_MANY and len(objects) > 1:
-                self._limit(tpdo, len(objects) - 1, abort)
-            self._mark_fixed(tpdo, abort)
+                self._learn(tpdo, _takes(len(objects) - 1), abort, most=len(objects) - 1)
+            self._learn(tpdo, "has a fixed map", abort, fixed=True)
 
     def _is_full(self, tpdo: Tpdo, position: int, abort: SdoAbort) -> Program[bool]:
         """Return whether the mapping is full, rather than the object unknown to the node."""
@@ -264,16 +270,6 @@ class Mapper:
         except SdoAbort:
             return True
         return False
-
-    def _limit(self, tpdo: Tpdo, most: int, abort: SdoAbort) -> None:
-        self._replace(replace(tpdo, most=most))
-        self._refuse(f"takes {most} object{'s' if most > 1 else ''}", tpdo, abort)
-        raise _MapFixed from abort
-
-    def _mark_fixed(self, tpdo: Tpdo, abort: SdoAbort) -> None:
-        self._replace(replace(tpdo, fixed=True))
-        self._refuse("has a fixed map", tpdo, abort)
-        raise _MapFixed from abort
 
     def _restore(self, tpdo: Tpdo) -> Program[None]:
         """Restore mapping and identifier after a refusal."""
@@ -315,3 +311,7 @@ class Mapper:
 def disable(node: int, tpdo: Tpdo) -> Program[None]:
     """Disable an unused TPDO."""
     yield Write(node, tpdo.communication, 1, tpdo.cob & ~EXTENDED | INVALID, 4)
+
+
+def _takes(most: int) -> str:
+    return f"takes {most} object{'s' if most > 1 else ''}"

@@ -308,7 +308,6 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing."""
 
     def _page(self) -> None:
-        self.close_connection = True
         page = files("drivelink.monitor").joinpath("page.html").read_bytes()
         token = self.web.acceptance.token if self.web.acceptance is not None else ""
         page = page.replace(b"{{token}}", token.encode())
@@ -318,7 +317,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _give(self, kind: str, content: bytes | Path) -> None:
         """Answer with some text, or a file."""
-        self.close_connection = True
         if isinstance(content, bytes):
             self._send(kind, content)
             return
@@ -333,10 +331,12 @@ class _Handler(BaseHTTPRequestHandler):
         self._head(kind, len(page))
         self.wfile.write(page)
 
-    def _head(self, kind: str, size: int) -> None:
+    def _head(self, kind: str, size: int | None = None) -> None:
+        self.close_connection = True
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(size))
+        if size is not None:
+            self.send_header("Content-Length", str(size))
         self.send_header("Cache-Control", "no-store")
         self.send_header("Content-Security-Policy", _POLICY)
         self.send_header("X-Content-Type-Options", "nosniff")
@@ -344,12 +344,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def _events(self) -> None:
-        self.close_connection = True
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", "text/event-stream")
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("Connection", "close")
-        self.end_headers()
+        self._head("text/event-stream")
         since: dict[str, float] = {}
         try:
             with self.web.stream(signals=self.path.endswith("?signals")) as over:

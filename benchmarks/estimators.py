@@ -26,15 +26,14 @@ from typing import NamedTuple
 
 import numpy as np
 import scene
+from scene import joints
 from world import T, simulate
 
 from estimator import (
     EstimatorSettings,
     JointModel,
-    Motor,
     Record,
     Status,
-    Transmission,
     make_estimator,
 )
 from estimator.sample import SIGMA_95
@@ -171,13 +170,10 @@ def drawn(case: Case, effect: str, seed: int, seconds: float, motion: str) -> Dr
         settings |= {"stiffness": k, setting: shape}
         if case.off is not None:
             parameters = {"k_nm_rad": case.off[0] * k, name: low + case.off[1] * (shape - low)}
-    motor = Motor(
-        inertia_kg_m2=inertia * (1.05 if effect == "inertia 5 % off" else 1.0),
-        viscous_damping_nm_s_rad=damping * (0.8 if effect == "damping 20 % off" else 1.0),
-        transmission=Transmission(model=case.model, order=case.order, parameters=parameters),
-    )
+    inertia *= 1.05 if effect == "inertia 5 % off" else 1.0
+    damping *= 0.8 if effect == "damping 20 % off" else 1.0
+    model = joints.joint_model(inertia, damping, model=case.model, order=case.order, parameters=parameters)
     world = simulate(**settings)
-    model = JointModel(arrangement="single", motors=(motor,))
     return Drawn(model, world.record, world.stiffness_nm_rad)
 
 

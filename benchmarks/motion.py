@@ -19,13 +19,14 @@ from typing import NamedTuple
 
 import numpy as np
 import scene
+from scene import joints
 from world import World, simulate
 
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.diagnosis.fourier import Limits, Shape
 from estimator.diagnosis.motion import design
 from estimator.driven import Path
-from estimator.model import JointModel, Motor, Transmission
+from estimator.model import JointModel
 
 LIKELY, SURE = 0.5, 0.9
 PERIOD_S = 1e-3
@@ -86,15 +87,11 @@ def joint_of(case: Case, seed: int) -> Joint:
         "link_inertia": rng.uniform(0.3, 0.5), "gravity": rng.uniform(1, 4), "torque_noise": 0.01,
         "motor_counts": 65536, **own,
     }  # fmt: skip
-    spring = Transmission(
-        model="polynomial", order=1, parameters={"coefficients_nm_rad": (settings["stiffness"],)}
-    )
-    motor = Motor(
-        inertia_kg_m2=settings["inertia"], viscous_damping_nm_s_rad=settings["damping"], transmission=spring
-    )
+    spring = {"coefficients_nm_rad": (settings["stiffness"],)}
+    model = joints.joint_model(settings["inertia"], settings["damping"], order=1, parameters=spring)
     most = {"low_rad": -0.8, "high_rad": 0.8, "velocity_rad_s": 4, "acceleration_rad_s2": 40, "torque_nm": 12}
     limits = Limits(**{name: np.array([float(value)]) for name, value in most.items()})
-    return Joint(settings, JointModel(arrangement="single", motors=(motor,)), limits)
+    return Joint(settings, model, limits)
 
 
 def ambiguous(outcome: Diagnosis) -> bool:

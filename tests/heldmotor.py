@@ -7,7 +7,7 @@ import joints
 import numpy as np
 import onlinekit as kit
 
-from estimator import JointModel, Motor, Sample, Transmission
+from estimator import Sample
 
 B, D, M, K = 0.12, 0.8, 0.4, 150.0
 PRESLIDING, SLIDING = 30.0, 0.5  # N·m/rad, up to so many N·m (Dahl's law)
@@ -48,5 +48,4 @@ def moved(seconds, kp=KP, hand_rad=0.02):
 
 def declared():
     """The joint as a user declares it, without its friction."""
-    motor = Motor(inertia_kg_m2=B, viscous_damping_nm_s_rad=D, transmission=Transmission(model="linear"))
-    return JointModel(arrangement="single", motors=(motor,), period_s=kit.PERIOD_S)
+    return joints.joint_model(B, D, model="linear", period_s=kit.PERIOD_S)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from estimator import EstimatorSettings, JointModel, Motor, Record, Transmission, make_estimator
+from estimator import Effect, EstimatorSettings, JointModel, Motor, Record, Transmission, make_estimator
 
 Array = np.ndarray
 
@@ -299,16 +299,20 @@ def sweep(
 
 def joint_model(
     B: float,
-    D: float,
+    D: float = 0.0,
     *,
     model: str = "polynomial",
     order: int | None = 2,
     m: int = 1,
     parameters: dict | None = None,
+    effects: tuple[Effect, ...] = (),
+    **joint: Any,
 ) -> JointModel:
+    """One or two motors that are alike, on a link; `order` is a polynomial's, `joint` what else the model has."""
+    order = order if model == "polynomial" else None
     transmission = Transmission(model=model, order=order, parameters=parameters or {})
-    motor = Motor(inertia_kg_m2=B, viscous_damping_nm_s_rad=D, transmission=transmission)
-    return JointModel(arrangement="single" if m == 1 else "antagonistic", motors=(motor,) * m)
+    motor = Motor(inertia_kg_m2=B, viscous_damping_nm_s_rad=D, transmission=transmission, effects=effects)
+    return JointModel(arrangement="single" if m == 1 else "antagonistic", motors=(motor,) * m, **joint)
 
 
 def estimates(model: JointModel, record: Record, **settings: Any) -> Array:

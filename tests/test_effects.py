@@ -14,8 +14,6 @@ from estimator import (
     EstimatorError,
     EstimatorSettings,
     JointModel,
-    Motor,
-    Transmission,
     fit,
     make_estimator,
 )
@@ -33,12 +31,8 @@ def _values(name: str) -> dict[str, float]:
 def _joint(*effects: Effect) -> JointModel:
     motor = tuple(e for e in effects if not LIBRARY[e.name].on_link)
     link = tuple(e for e in effects if LIBRARY[e.name].on_link)
-    transmission = Transmission(model="linear", parameters={"k_nm_rad": 100.0})
-    return JointModel(
-        arrangement="single",
-        motors=(Motor(inertia_kg_m2=0.1, transmission=transmission, effects=motor),),
-        link_effects=link,
-    )
+    spring = {"model": "linear", "parameters": {"k_nm_rad": 100.0}}
+    return joints.joint_model(0.1, **spring, effects=motor, link_effects=link)
 
 
 @pytest.mark.parametrize("name", sorted(n for n, k in LIBRARY.items() if not k.remembers))
@@ -78,10 +72,7 @@ def test_the_paper_modes_residual_is_that_over_arrays():
     t = np.arange(n) * T
     theta, omega = 0.2 * np.sin(9.0 * t), 1.8 * np.cos(9.0 * t)
     tau = rng.normal(size=n)
-    motor = Motor(
-        inertia_kg_m2=inertia, viscous_damping_nm_s_rad=damping, transmission=Transmission(model="none")
-    )
-    model = JointModel(arrangement="single", motors=(motor,))
+    model = joints.joint_model(inertia, damping, model="none")
     paper = make_estimator(model, EstimatorSettings(mode="paper", k_tau_rad_s=300.0), T)
     rows = zip(theta.tolist(), omega.tolist(), tau.tolist(), strict=True)
     estimated = [paper.step(Sample(k, (x,), (v,), (u,)))[2] for k, (x, v, u) in enumerate(rows)]
@@ -130,11 +121,7 @@ def rig():
 
 
 def _model(effects, order=1):
-    transmission = Transmission(model="polynomial", order=order)
-    motor = Motor(
-        inertia_kg_m2=0.12, viscous_damping_nm_s_rad=0.8, transmission=transmission, effects=effects
-    )
-    return JointModel(arrangement="single", motors=(motor,))
+    return joints.joint_model(0.12, 0.8, order=order, effects=effects)
 
 
 def test_stiffness_and_torque_on_line_are_those_of_model_and_elastic_effects_together(rig):

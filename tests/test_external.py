@@ -84,9 +84,7 @@ def push(t):
 
 
 def model(link=LINK, **transmission):
-    given = {"model": "polynomial", "order": 2} | transmission
-    motor = Motor(inertia_kg_m2=0.125, viscous_damping_nm_s_rad=0.8, transmission=Transmission(**given))
-    return JointModel(arrangement="single", motors=(motor,), link=link)
+    return joints.joint_model(0.125, 0.8, link=link, **transmission)
 
 
 def samples(rows, measured=False):
@@ -226,8 +224,7 @@ def test_a_motor_that_friction_stops_is_not_suspected_of_a_frozen_reading(high_h
 @pytest.mark.parametrize("again", [False, True])
 def test_a_light_motor_that_is_in_motion_when_it_is_seen_is_not_suspected(again):
     """It turns with 200 rad/s²: more than the bare motor of a small drive usually does."""
-    motor = replace(joints.joint_model(5e-4, 5e-3).motors[0], transmission=Transmission(model="none"))
-    estimator = make_estimator(JointModel(arrangement="single", motors=(motor,)), EstimatorSettings(), T)
+    estimator = make_estimator(joints.joint_model(5e-4, 5e-3, model="none"), EstimatorSettings(), T)
     for k in range(2000):
         if again and k == 1000:
             estimator.core.lose_zeros()
@@ -288,8 +285,7 @@ def test_the_flexibility_torque_from_the_link_side_is_the_true_one(pushed):
 
 def test_nothing_is_said_where_nothing_is_declared_and_a_rigid_transmission_reveals_nothing(free):
     undeclared, rigid = (
-        make_estimator(joint, EstimatorSettings(), T)
-        for joint in (model(None), model(model="none", order=None))
+        make_estimator(joint, EstimatorSettings(), T) for joint in (model(None), model(model="none"))
     )
     for sample in samples({name: column[:500] for name, column in free.items()}):
         undeclared.step(sample)

@@ -19,7 +19,7 @@ from drivelink import jointfile, recording
 from drivelink.cli import main
 from drivelink.jointfile.document import MAX_LINE_BYTES
 from drivelink.runs import Runs
-from estimator import JointModel, LinkDynamics, Motor, Record, Transmission, fit
+from estimator import LinkDynamics, Record, fit
 from estimator.identify import identify
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -148,8 +148,7 @@ def arm() -> Record:
 @pytest.mark.parametrize("gravity_nm", [0.0, 4.0])
 def test_gravity_and_friction_of_a_joint_with_one_encoder(arm, gravity_nm):
     link = replace(ARM, gravity_nm=gravity_nm, gravity_phase_rad=0.0)
-    motor = Motor(inertia_kg_m2=ROTOR, viscous_damping_nm_s_rad=0.6, transmission=Transmission(model="none"))
-    found = identify(arm, JointModel(arrangement="single", motors=(motor,), link=link))
+    found = identify(arm, joints.joint_model(ROTOR, 0.6, model="none", link=link))
     link, (motor,) = found.model.link or link, found.model.motors
     for name, truth in (("gravity_nm", ARM.gravity_nm), ("gravity_phase_rad", ARM.gravity_phase_rad)):
         # Amplitude and phase share with a constant torque what the arc does not separate: the interval shows it.

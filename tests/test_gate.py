@@ -22,7 +22,7 @@ from drivelink import jointfile, recording
 from drivelink.cli import main
 from drivelink.jointfile import parse
 from drivelink.recording.corrections import corrections
-from estimator import JointModel, Motor, Record, Transmission
+from estimator import JointModel, Record
 from estimator.gate import Change, Discrepancy, examine, judge
 from estimator.gate.causes import causes
 from estimator.identify import identify
@@ -32,11 +32,7 @@ from sim.world import record
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
 DEGREE = 180.0 / math.pi
-UW = JointModel(
-    arrangement="single",
-    motors=(Motor(inertia_kg_m2=5.878e-4, transmission=Transmission(model="linear")),),
-    period_s=0.005,
-)
+UW = joints.joint_model(5.878e-4, model="linear", period_s=0.005)
 MEASURED = (  # the first in the default run
     ("emps/train.csv", "emps"),
     ("emps/pulses.csv", "emps"),
@@ -310,8 +306,7 @@ def test_a_jerk_before_a_slow_motion_does_not_make_its_encoder_noise_an_inertia(
     count = 2.0 * math.pi / 2**16
     read = joints.quantise(motor[rows], count), torque[rows], joints.quantise(link[rows], 0.5 * count)
     record = joints.recorded(*read, period)
-    spring = Motor(inertia_kg_m2=B, transmission=Transmission(model="linear"))
-    assert examine(record, JointModel(arrangement="single", motors=(spring,), period_s=period)) == []
+    assert examine(record, joints.joint_model(B, model="linear", period_s=period)) == []
 
 
 @needs_data

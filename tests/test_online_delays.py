@@ -1,10 +1,11 @@
 """Declared delays: the balance is formed of channels of one moment, the torque is published for the present."""
 
+import joints
 import numpy as np
 import pytest
 
-from estimator import EstimatorSettings, Sample, Status, make_estimator
-from estimator.model import Effect, JointModel, Motor, Transmission
+from estimator import EstimatorSettings, Status, make_estimator
+from estimator.model import Effect
 
 T = 1e-3
 N = 12_000
@@ -26,9 +27,7 @@ def _motion(t, spin):
 def _joint(link_late_s):
     torque = Effect(name="torque_delay", parameters={"delay_s": -LATE_S})
     link = Effect(name="encoder_delay", parameters={"delay_s": link_late_s})
-    spring = Transmission(model="linear")
-    motor = Motor(inertia_kg_m2=B, viscous_damping_nm_s_rad=D, transmission=spring, effects=(torque,))
-    return JointModel(arrangement="single", motors=(motor,), link_effects=(link,))
+    return joints.joint_model(B, D, model="linear", effects=(torque,), link_effects=(link,))
 
 
 @pytest.mark.parametrize(
@@ -47,8 +46,8 @@ def test_a_torque_that_is_reported_late_is_published_for_the_present(spin, link_
     late_theta, _, late_phi = _motion(t - link_late_s, spin)
     torque = _motion(t + 0.5 * T - LATE_S, spin)[1]
     estimator = make_estimator(_joint(link_late_s), EstimatorSettings(), T)
-    read = zip(theta + noise[0], torque, late_theta + late_phi + noise[1], strict=True)
-    said = [estimator.step(Sample(k, (a,), (np.nan,), (u,), q)) for k, (a, u, q) in enumerate(read)][SETTLED]
+    read = joints.recorded(theta + noise[0], torque, late_theta + late_phi + noise[1], T)
+    said = [estimator.step(sample) for sample in read.samples()][SETTLED]
     # A late link is known well enough for a torque at 200 rad/s after a second.
     assert np.mean([bool(one.status & Status.VALID) for one in said]) > 0.97
     assert np.abs(np.array([one.stiffness_nm_rad for one in said]) / K - 1.0).max() < 0.01

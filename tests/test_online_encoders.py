@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import joints
 import numpy as np
 import onlinekit as kit
 import pytest
@@ -91,14 +92,12 @@ def test_rounding_at_rest_is_no_effect(seed):
     held = torque.reshape(-1, fine).mean(axis=1) + 0.02 * rng.normal(size=len(q) // fine)
     count = 2.0 * math.pi / 2**17
     read = np.round(np.stack((theta, q))[:, ::fine] / count) * count
-    spring = kit.Transmission(model="linear", parameters={"k_nm_rad": stiffness})
-    motor = kit.Motor(inertia_kg_m2=0.03, viscous_damping_nm_s_rad=0.25, transmission=spring)
-    joint = kit.JointModel(arrangement="single", motors=(motor,))
+    joint = joints.joint_model(0.03, 0.25, model="linear", parameters={"k_nm_rad": stiffness})
     estimator = kit.make_estimator(joint, kit.EstimatorSettings(), period)
-    for k, (a, b, tau) in enumerate(np.stack((*read, held)).T.tolist()):
-        estimate = estimator.step(kit.Sample(k, (a,), (math.nan,), (tau,), b))
-        if k * period > 8.0:  # few blocks may show an effect for a moment
-            assert estimator.undeclared() == [[]] and estimate.status & kit.VALID, k * period
+    for sample in joints.recorded(read[0], held, read[1], period).samples():
+        estimate, at_s = estimator.step(sample), sample.sequence * period
+        if at_s > 8.0:  # few blocks may show an effect for a moment
+            assert estimator.undeclared() == [[]] and estimate.status & kit.VALID, at_s
 
 
 def rebooted(motion, name, off, doubted=-1):

@@ -183,8 +183,7 @@ def test_an_encoder_that_moves_its_zero_is_followed(rig):
     st.sampled_from(["polynomial", "vsa-ii", "none", "unknown"]),
 )
 def test_no_float_makes_a_tick_raise(rows, mode, model):
-    motor = Motor(inertia_kg_m2=0.1, transmission=Transmission(model=model))
-    joint = JointModel(arrangement="single", motors=(motor,))
+    joint = joints.joint_model(0.1, model=model, order=None)
     estimator = make_estimator(joint, EstimatorSettings(mode=mode), T)
     with np.errstate(all="ignore"):
         for sequence, theta, tau, q in rows:

@@ -264,6 +264,16 @@ def test_the_command_prints_one_json_object(capsys):
     assert {"section", "severity", "subject", "text", "fix"} == set(printed["findings"][0])
 
 
+def test_a_placeholder_that_is_still_there_is_found(tmp_path, capsys):
+    path = tmp_path / "elbow.toml"
+    assert main(["new", str(path), "--interface", "virtual", "--channel", "nobody"]) == 0
+    for inertia, found in (("0.1", True), ("0.25", False)):
+        path.write_text(path.read_text().replace("inertia_kg_m2 = 0.1 ", f"inertia_kg_m2 = {inertia} "))
+        capsys.readouterr()
+        main(["doctor", str(path), "--json", "--seconds", "0.1"])
+        assert ("placeholder" in capsys.readouterr().out) is found
+
+
 def test_scanning_asks_every_id_and_listening_counts_what_is_not_canopen_too():
     wire = Wire([Slave(3, drive_objects(3)), Slave(77, drive_objects(77))])
     wire.put(0x705, b"\x05")  # alive, but without SDO

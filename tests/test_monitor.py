@@ -22,7 +22,7 @@ from rich.console import Console
 from drivelink import cli
 from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
 from drivelink.monitor.statuslines import shape, status_lines
-from drivelink.monitor.terminal import can_draw, joints_table
+from drivelink.monitor.terminal import joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.web import snapshot
 from drivelink.output.numbers import number, with_interval
@@ -381,14 +381,6 @@ def test_an_error_of_the_valid_cycles_does_not_stand_beside_an_estimate_that_is_
     last = estimate(5000, status=0)
     view.update(last, 5.0, Truth(last[2], last[3]))
     assert "truth" in "\n".join(lines(view)) and " error " not in "\n".join(lines(view)) + view.line()
-
-
-def test_a_live_view_needs_a_terminal_with_its_characters():
-    for encoding, able in (("utf-8", True), ("ascii", False), ("latin-1", False)):
-        file = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
-        assert can_draw(Console(file=file, force_terminal=True)) is able
-        assert not can_draw(Console(file=file, force_terminal=False))
-        assert not can_draw(Console(file=file, force_terminal=True, _environ={"TERM": "dumb"}))
 
 
 @pytest.mark.parametrize(

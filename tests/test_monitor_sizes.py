@@ -1,6 +1,7 @@
 """Live views in a terminal that is small, or has more to show than lines."""
 
 import io
+import math
 from types import SimpleNamespace
 
 from rich.console import Console
@@ -8,7 +9,10 @@ from test_monitor import STATUS, filled, lines
 
 from drivelink.cli.monitor import _picture
 from drivelink.monitor.statuslines import shape, status_lines
-from drivelink.monitor.terminal import joints_table
+from drivelink.monitor.terminal import can_draw, joints_table
+from drivelink.monitor.view import JointView
+from drivelink.monitor.web import snapshot
+from estimator.sample import Estimate, TransmissionEstimate
 
 
 def test_a_small_view_has_its_names_whole_and_says_whether_it_is_valid():
@@ -51,3 +55,20 @@ def test_more_joints_than_lines_are_counted_and_what_needs_a_look_comes_first():
     console.print(_picture(watcher, console, "", 0.0))
     shown = console.export_text().rstrip("\n").split("\n")
     assert len(shown) <= 24 and "joint-25" in shown[1] and "and 11 more" in "".join(shown)
+
+
+def test_a_rigid_joint_is_not_said_to_have_no_stiffness_yet():
+    view = JointView("axis")
+    view.update(Estimate(1, 1, 0.5, math.nan, math.nan, (TransmissionEstimate(0.5, *[math.nan] * 3),)), 1.0)
+    view.model = {"motors": [{"transmission": {"model": "none"}}]}
+    assert "a rigid joint has none" in "\n".join(lines(view)) and snapshot(view, True, {})["status"]["rigid"]
+    view.model = {"motors": [{"transmission": {"model": "linear"}}]}
+    assert "no values yet" in "\n".join(lines(view)) and not snapshot(view, True, {})["status"]["rigid"]
+
+
+def test_a_live_view_needs_a_terminal_with_its_characters():
+    for encoding, able in (("utf-8", True), ("ascii", False), ("latin-1", False)):
+        file = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+        assert can_draw(Console(file=file, force_terminal=True)) is able
+        assert not can_draw(Console(file=file, force_terminal=False))
+        assert not can_draw(Console(file=file, force_terminal=True, _environ={"TERM": "dumb"}))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from drivelink.canopen.scan import FoundNode
 from drivelink.canopen.vendors import vendor_of
 from drivelink.errors import DriveError
-from drivelink.jointfile import parse
+from drivelink.jointfile import JointFile, parse
 
 _GCM2 = 1e-7  # kg·m² a g·cm²
 _PLACEHOLDER = 0.1  # kg·m², where the inertia is not known
@@ -128,6 +128,11 @@ _ZENOH = """\
 # endpoint = "tcp/127.0.0.1:7447"  # where subscribers connect
 # config = "zenoh.json5"  # instead: a zenoh configuration of your own
 """
+
+
+def left_open(joint: JointFile, text: str) -> bool:
+    """Return whether a joint file still has the placeholder of an inertia."""
+    return "PLACEHOLDER" in text and any(motor.inertia_kg_m2 == _PLACEHOLDER for motor in joint.motor)
 
 
 def _motor(answers: Answers, index: int, node: int) -> str:

@@ -12,6 +12,7 @@ from typing import TextIO
 
 from rich.console import Console
 
+from drivelink.canopen.newfile import left_open
 from drivelink.cli import add_bus, add_number, moved
 from drivelink.doctor import examine, examine_eds
 from drivelink.doctor.livevalues import live_values
@@ -68,6 +69,12 @@ def run(args: argparse.Namespace) -> int:
         if args.move:
             return _by_hand(joint, args, seconds)
         report = examine(joint, args.joint.parent if args.joint else Path(), seconds)
+        if joint is not None and left_open(joint, args.joint.read_text(encoding="utf-8")):
+            report.section("Joint file").warn(
+                "motor",
+                "inertia_kg_m2 is the placeholder of drivelink new",
+                "put in your motor's, joint side",
+            )
     if args.json:
         print(json.dumps(report.as_dict()))
     else:

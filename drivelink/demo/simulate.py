@@ -112,9 +112,13 @@ def assumptions(joint: JointFile) -> list[str]:
                 f"motor[{index}].transmission has no parameters: simulated with {k:.3g} N·m/rad at rest, "
                 f"{_NATURAL_HZ:g} Hz with the motor's inertia"
             )
-    if joint.link.dynamics is None:
+    if joint.link.dynamics is None and not _one_body(joint):
         lines.append("no [link.dynamics]: simulated with twice the first motor's inertia at the link")
     return lines
+
+
+def _one_body(joint: JointFile) -> bool:
+    return joint.motor[0].transmission.model == "none"
 
 
 def _assumed_stiffness(motor: MotorSection) -> float:
@@ -135,8 +139,12 @@ def _spring(motor: MotorSection, index: int) -> Spring:
 
 
 def _plant(joint: JointFile) -> JointPlant:
-    """Return the declared joint; without link dynamics the link has twice the first motor's inertia."""
-    link = joint.link.dynamics or LinkDynamics(inertia_kg_m2=2.0 * joint.motor[0].inertia_kg_m2)
+    """Return the declared joint; without link dynamics the link has twice the first motor's inertia.
+
+    The inertia that a rigid joint declares is then that of the whole: next to nothing is left for its link.
+    """
+    share = 1e-6 if _one_body(joint) else 2.0
+    link = joint.link.dynamics or LinkDynamics(inertia_kg_m2=share * joint.motor[0].inertia_kg_m2)
     return JointPlant(
         arrangement=joint.arrangement,
         motors=tuple(

@@ -19,6 +19,7 @@ from drivelink.loop import finding as findings
 from drivelink.monitor.braille import gauge
 from drivelink.output.numbers import number
 from drivelink.plaintext import clean_text, natural
+from estimator.transmissions import RIGID
 
 MODEL_ALARM_ADVICE = (
     "the model is not sufficient: do not control on its numbers; record a minute of motion "
@@ -77,6 +78,7 @@ class Shown:
     nodes: tuple[NodeState, ...] = ()  # of the bus
     wrong: tuple[str, ...] = ()  # faults and conditions that hold now
     not_valid: str = ""  # why the estimate is not valid; empty: it is
+    rigid: bool = False  # whether the joint has no stiffness
     alarm: bool = False  # whether the model alarm is on
     location: str = ""  # likely location of the missing effect
     residual_nm: float | None = None  # of the whole model, N·m, or None
@@ -123,6 +125,7 @@ def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> 
         ),
         wrong=_together(wrong),
         not_valid=_text(status.get("not_valid")),
+        rigid=_rigid(model or {}),
         alarm=alarm.get("active") is True,
         location=_text(alarm.get("location")),
         residual_nm=_number(status.get("residual_nm")) or None,  # 0: there was no motion to judge it by
@@ -202,6 +205,12 @@ def _balances(alarm: Mapping[str, Any], motors: int) -> tuple[ResidualGauge, ...
         for name, (residual, baseline) in zip([*names, "link"], pairs, strict=False)
         if residual is not None and baseline is not None and residual >= 0.0 and baseline > 0.0
     )
+
+
+def _rigid(model: Mapping[str, Any]) -> bool:
+    motors = model.get("motors")
+    motor = motors[0] if isinstance(motors, list) and motors else None
+    return isinstance(motor, Mapping) and _part(motor, "transmission").get("model") == RIGID
 
 
 def _improved(model: Mapping[str, Any]) -> tuple[float, float] | None:

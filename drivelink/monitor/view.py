@@ -309,13 +309,17 @@ class JointView:
             for one in self.history.latest.transmissions:
                 plot.mark(one.deflection_rad, one.stiffness_nm_rad, "bold")
         if not points:
-            plot.note(self._why_empty())
+            plot.note(self._no_stiffness())
         title = "stiffness over deflection, N·m/rad"
         return plot.render(title if width >= 41 else "stiffness, N·m/rad", "rad")
 
     def _why_empty(self) -> str:
         """Why there is no curve yet."""
         return shape(self.status).not_valid or "no values yet"
+
+    def _no_stiffness(self) -> str:
+        """Why there is no stiffness yet, or never."""
+        return "a rigid joint has none" if shape({}, self.model).rigid else self._why_empty()
 
     def _time_plot(
         self,

@@ -69,10 +69,14 @@ def _motor(motor: MotorPlant, key: str, name: str, value: float) -> MotorPlant:
 
 
 def typical_torque_nm(plant: JointPlant) -> float:
-    """Return a torque with a suitable motion: 0.15 rad in a soft spring, less in a stiff one."""
+    """Return a torque with a suitable motion: 0.15 rad in a soft spring, less in a stiff one.
+
+    A rigid joint is one body, which it accelerates by 5 rad/s².
+    """
     springs = [motor.spring for motor in plant.motors if not motor.spring.rigid]
     if not springs:
-        return max(abs(plant.link.gravity_nm), 5.0 * plant.link.inertia_kg_m2)
+        whole = plant.link.inertia_kg_m2 + sum(motor.inertia_kg_m2 for motor in plant.motors)
+        return max(abs(plant.link.gravity_nm), 5.0 * whole)
     stiffness = min(abs(spring.law().stiffness(0.0)) for spring in springs)
     softness = max(1.0, stiffness / _SOFT_NM_RAD)
     return float(_SOFT_DEFLECTION_RAD * stiffness / softness * softness**0.25)

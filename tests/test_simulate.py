@@ -165,6 +165,9 @@ def test_two_joints_share_a_bus_and_their_data_sheets_are_written(tmp_path):
 
 def test_a_rigid_joint_is_simulated_with_the_inertia_that_it_declares():
     rigid = parse('name = "axis"\n[[motor]]\ninertia_kg_m2 = 0.002\n[motor.transmission]\nmodel = "none"\n')
-    plant = world_from_joint(rigid).plant
+    world = world_from_joint(rigid)
+    world.advance(2000)
+    assert abs(world.truth().link_position_rad) > 0.01  # it moves
+    plant = world.plant
     whole = plant.motors[0].inertia_kg_m2 + plant.link.inertia_kg_m2
     assert whole == pytest.approx(0.002, rel=1e-5) and assumptions(rigid) == []

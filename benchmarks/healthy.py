@@ -16,8 +16,9 @@ from dataclasses import replace
 import numpy as np
 import scene
 import world
+from scene import joints
 
-from estimator import JointModel, LinkDynamics, Motor, Transmission
+from estimator import JointModel, LinkDynamics
 from estimator.diagnosis import diagnose
 from estimator.errors import EstimatorError
 from estimator.identify import identify
@@ -45,17 +46,14 @@ def joint(rng: np.random.Generator) -> tuple[dict[str, float | str], JointModel]
         "link_bits": float(rng.integers(17, 21)),
         "torque_noise": float(rng.choice([0.0, 0.01, 0.05])),
     }
-    motor = Motor(
-        inertia_kg_m2=inertia * float(rng.uniform(0.95, 1.05)),
-        viscous_damping_nm_s_rad=float(made["damping"]),
-        transmission=Transmission(model=MODELS[spring]),
-    )
+    inertia *= float(rng.uniform(0.95, 1.05))
     link = LinkDynamics(
         inertia_kg_m2=float(made["link_inertia"]) * float(rng.uniform(0.95, 1.05)),
         viscous_damping_nm_s_rad=float(made["link_damping"]),
         gravity_nm=float(made["gravity"]),
     )
-    return made, JointModel(arrangement="single", motors=(motor,), link=link)
+    damping = float(made["damping"])
+    return made, joints.joint_model(inertia, damping, model=MODELS[spring], order=None, link=link)
 
 
 def motion(rng: np.random.Generator, kind: str, stiffness: float) -> dict[str, float | str]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import joints
 import numpy as np
 
-from estimator.model import JointModel, LinkDynamics, Motor, Transmission
+from estimator.model import JointModel, LinkDynamics
 from estimator.sample import FloatArray, Record
 
 PERIOD_S = 1e-3
@@ -121,14 +121,10 @@ class World:
 
 def model(error: float = 0.0, *, linked: bool = True) -> JointModel:
     """The joint as declared, its numbers off by a share."""
-    motor = Motor(
-        inertia_kg_m2=INERTIA * (1 + error),
-        viscous_damping_nm_s_rad=DAMPING * (1 - error),
-        transmission=Transmission(model="linear"),
-    )
     link = LinkDynamics(
         inertia_kg_m2=LINK_INERTIA * (1 - error),
         viscous_damping_nm_s_rad=LINK_DAMPING * (1 + error),
         gravity_nm=GRAVITY * (1 + error),
     )
-    return JointModel(arrangement="single", motors=(motor,), link=link if linked else None)
+    inertia, damping = INERTIA * (1 + error), DAMPING * (1 - error)
+    return joints.joint_model(inertia, damping, model="linear", link=link if linked else None)

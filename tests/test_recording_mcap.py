@@ -24,6 +24,7 @@ from drivelink.recording.foxglove import write_layouts
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages, recorded_cycles
 from drivelink.recording.messages import message_schema
+from drivelink.recording.playback import open_playback
 from estimator.sample import SIGMA_95, Sample, Status, TransmissionEstimate
 
 TEXT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
@@ -189,6 +190,19 @@ def test_batches_of_any_length_and_another_run_of_the_daemon_are_cycles_with_the
     cycles = list(recorded_cycles(path, 1))
     assert [c.sequence for c in cycles] == [*range(runs[0]), *range(runs[1])]
     assert [k for k, c in enumerate(cycles) if c.flags] == list(range(0, sum(runs), 70))
+
+
+def test_time_goes_on_where_the_daemon_began_again(tmp_path):
+    path, began = tmp_path / "r.mcap", (300, 0)
+    sink = open_sink(path, JOINT)
+    for at, begin in zip((0.0, 0.4321), began, strict=True):
+        for k in range(100):
+            sink.sample(sample(begin + k), BEGIN_NS + round(1e9 * at) + k * 1_000_000)
+    sink.close()
+    time_s = read(path, JOINT).time_s
+    assert np.diff(time_s)[99] == pytest.approx(0.333) and np.diff(time_s).min() == pytest.approx(1e-3)
+    played = [one.time_s for one in open_playback(path, JOINT, tmp_path)]
+    assert played[-1] - played[0] == pytest.approx(0.4321 + 0.099) and min(np.diff(played)) > 0.0
 
 
 def test_what_is_no_mcap_file_is_one_clear_line(tmp_path):

@@ -285,6 +285,7 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
     """
     columns: dict[str, array[float]] = {}
     count, numbers_of = 0, JsonNumbers(sorted(COLUMNS))
+    period_s, shift_s, stamp_ns = joint.bus.period_s if joint is not None else 0.0, 0.0, 0
     for message in read_messages(path, frozenset({"sample"})):
         try:
             row = numbers_of(message.data)
@@ -294,6 +295,9 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
                 row = numbers_of(message.data)
             for values, value in zip(columns.values(), row, strict=True):
                 values.append(math.nan if value is None else value)
+            if "time_s" in columns:
+                shift_s = _gone_on(columns["time_s"], shift_s, message.log_time_ns - stamp_ns, period_s)
+            stamp_ns = message.log_time_ns
         except ValueError as error:
             raise _strange(path, message.topic, error) from error
         count += 1
@@ -302,6 +306,17 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
         raise RecordingError(f"{path}: no samples in it (with raw frames in it: replay --frames)")
     table = {name: np.frombuffer(values, dtype=np.float64) for name, values in columns.items()}
     return record_from_columns(table, str(path), joint, keep_nan)
+
+
+def _gone_on(time_s: array[float], shift_s: float, elapsed_ns: int, period_s: float) -> float:
+    """Put the last time behind the others where the daemon began again; return what its run lacks."""
+    time_s[-1] += shift_s
+    if len(time_s) < 2 or time_s[-1] > time_s[-2] or elapsed_ns <= 0:
+        return shift_s
+    behind_s = time_s[-2] - time_s[-1] + 1e-9 * elapsed_ns
+    behind_s = period_s * round(behind_s / period_s) if period_s else behind_s
+    time_s[-1] += behind_s
+    return shift_s + behind_s
 
 
 def _strange(path: Path, topic: str, error: Exception) -> RecordingError:

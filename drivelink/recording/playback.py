@@ -66,8 +66,13 @@ class Playback:
         self._cycles, self._start_s = cycles, start_s
 
     def __iter__(self) -> Iterator[Played]:
+        start_s, last = self._start_s, None
         for tick in estimated(self._cycles(self.pipeline), self.pipeline):
-            yield Played(self._start_s + tick.sequence * self.period_s, tick)
+            if last is not None and tick.sequence <= last.sequence:  # of a daemon that began again
+                start_s += (last.sequence - tick.sequence) * self.period_s
+                start_s += max(self.period_s, 1e-9 * (tick.stamp_ns - last.stamp_ns))
+            last = tick
+            yield Played(start_s + tick.sequence * self.period_s, tick)
 
 
 def open_playback(

@@ -74,7 +74,7 @@ def check_target(
     if not makes_folder and not path.parent.exists():
         raise UsageError(f"{path}: there is no folder {path.parent}")
     if not force and path.is_file():
-        raise UsageError(f"{path}: exists already; --force replaces it")
+        raise UsageError(f"{path}: exists already; force=True replaces it")
 
 
 def _same(path: Path, other: Path) -> bool:

@@ -205,6 +205,8 @@ def test_a_named_file_is_replaced_with_force_only(command, files, capsys):
     assert cli.main([verb, *rest]) == 2
     assert capsys.readouterr().err == f"drivelink {verb}: {out}: exists already; --force replaces it\n"
     assert out.read_text() == "kept"
+    with pytest.raises(UsageError, match="exists already; force=True replaces it"):  # in Python
+        check_target(out, [], force=False)
     assert cli.main([verb, *rest, "--force"]) == 0
     assert out.read_text() != "kept"
 

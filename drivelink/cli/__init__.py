@@ -170,7 +170,8 @@ def _main(argv: list[str] | None) -> int:
             getattr(args, "parser", parser).error(f"unrecognized arguments: {' '.join(unknown)}")
         return int(args.run(args))
     except DrivelinkError as error:
-        return _fail(verb, f"{error}{_instead_of_a_name(error)}", error.exit_status)
+        said = str(error).replace("force=True", "--force")  # as in Python
+        return _fail(verb, f"{said}{_instead_of_a_name(error)}", error.exit_status)
     except EstimatorError as error:
         return _fail(verb, error, 1)
     except BrokenPipeError:

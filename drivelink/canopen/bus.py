@@ -224,6 +224,8 @@ def _reason(error: BaseException) -> str:
         if number in _REASONS:
             return _REASONS[number]
         cause = cause.__cause__ or cause.__context__
+    if "could not open bus" in str(error):  # socketcand's answer
+        return "the server has no bus of this name"
     return one_line(str(error)) or type(error).__name__
 
 

@@ -2,8 +2,11 @@
 
 import io
 import math
+import signal
 from types import SimpleNamespace
 
+import pytest
+import zenohkit
 from rich.console import Console
 from test_monitor import STATUS, filled, lines
 
@@ -72,3 +75,12 @@ def test_a_live_view_needs_a_terminal_with_its_characters():
         assert can_draw(Console(file=file, force_terminal=True)) is able
         assert not can_draw(Console(file=file, force_terminal=False))
         assert not can_draw(Console(file=file, force_terminal=True, _environ={"TERM": "dumb"}))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_view_is_stopped_by_a_signal_and_that_is_no_failure(number):
+    endpoint = zenohkit.free_endpoint()
+    with zenohkit.process("monitor", "--web", "--port", "0", "--endpoint", endpoint) as view:
+        assert "live view: http://127.0.0.1:" in view.stdout.readline()
+        view.send_signal(number)
+        assert view.wait(60.0) == 0 and view.stderr.read() == ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 import time
 from contextlib import ExitStack, closing, suppress
@@ -15,7 +16,7 @@ from rich.live import Live
 from rich.text import Text
 
 from drivelink import jointfile
-from drivelink.cli import add_number, add_seconds
+from drivelink.cli import add_number, add_seconds, handling
 from drivelink.errors import UsageError, ZenohError
 from drivelink.loop.finding import folder_of
 from drivelink.monitor.statuslines import shape
@@ -105,6 +106,7 @@ def run(args: argparse.Namespace) -> int:
         watcher = Watcher(session, prefix, name)
         stack.callback(watcher.close)
         stack.enter_context(suppress(KeyboardInterrupt))
+        stack.enter_context(handling(signal.default_int_handler))
         if args.web:
             _serve(watcher, args, end, acceptance)
         elif not args.json and can_draw(console := Console()):
@@ -124,7 +126,7 @@ def _foxglove(session: zenoh.Session, args: argparse.Namespace, end: float) -> N
     with Recorder(sink, []) as recorder, closing(ZenohTap(session, joint, sink)) as tap:
         recorder.taps.append(tap)
         print(f"open a connection to ws://127.0.0.1:{sink.port}   (Ctrl-C ends)", flush=True)
-        with suppress(KeyboardInterrupt):
+        with suppress(KeyboardInterrupt), handling(signal.default_int_handler):
             recorder.run(lambda: time.monotonic() >= end)
 
 

@@ -218,13 +218,32 @@ def test_a_zero_far_from_the_declared_one_is_found(name, seed, off_rad):
     assert np.max(off[-8000:]) < 0.02
 
 
-def test_a_change_is_found_beside_friction_that_nobody_declared():
-    """A third of the torque. In a fast motion the filtered sign of the velocity is small although the motor never rests."""
-    effects = [make("coulomb_friction", {"torque_nm": 0.01}, motor) for motor in range(2)]
-    moved = kit.motion("vsa-ii", 14.0, effects=effects, step=(10.0, 1.2))
-    estimates, _ = kit.play(kit.declared("vsa-ii"), moved.samples)
+@pytest.mark.parametrize("name", ["constant", "quadratic", "vsa-ii"])
+def test_a_change_is_found_beside_friction_that_nobody_declared(name):
+    """A third of the torque. In a fast motion the filtered sign of the velocity is small although the motor never rests;
+    the first blocks, of which friction was not known, must not hide what the next ones leave."""
+    motors = len(kit.declared(name).motors)
+    size = 0.3 * np.sqrt(
+        np.mean([sample.motor_torque_nm[0] ** 2 for sample in kit.motion(name, 6.0).samples])
+    )
+    effects = [make("coulomb_friction", {"torque_nm": size}, motor) for motor in range(motors)]
+    moved = kit.motion(name, 18.0, effects=effects, step=(12.0, 1.2))
+    estimates, _ = kit.play(kit.declared(name), moved.samples)
     changed = np.flatnonzero(estimates.status & Status.CHANGED)
-    assert changed.size and 10000 <= changed[0] < 10500
+    off = np.abs(estimates.stiffness_nm_rad / moved.stiffness_nm_rad - 1.0)
+    assert changed.size and 12000 <= changed[0] < 13500
+    assert np.median(off[6000:12000]) < 0.001
+    assert np.median(off[-1000:]) < 0.02
+    assert not np.any(kit.wrong(estimates, moved.stiffness_nm_rad)[13500:])
+
+
+def test_friction_of_the_load_that_nobody_declared_is_no_change():
+    """Its sign is anything at rest, as that of other friction is: what blocks leave there comes in bursts."""
+    lost = make("back_driving_loss", {"coefficient": 0.3}, 0)
+    moved = kit.motion("constant", 16.0, effects=[lost])
+    estimates, estimator = kit.play(kit.declared("constant"), moved.samples)
+    assert estimator.undeclared()[0] == ["load_dependent_friction"]
+    assert not np.any(estimates.status & Status.CHANGED)
 
 
 @pytest.mark.parametrize("declared_nm", [0.0, 0.15])

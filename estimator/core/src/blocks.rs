@@ -4,20 +4,21 @@ mod changes;
 mod family;
 mod interval;
 mod readout;
+mod rows;
 mod solve;
 
 use serde::{Deserialize, Serialize};
 
 use crate::balance;
 use crate::causes::{Noise, Odds};
-use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, TAILS, UNUSUAL};
-use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse};
+use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, TAILS};
+use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, inverse};
 use crate::library::Element;
 use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection};
 use crate::student::f_quantile;
-use crate::unknowns::{ACTIVE, DRY, Spring};
+use crate::unknowns::{ACTIVE, Spring};
 
 /// What a block did.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -69,6 +70,7 @@ pub struct Blocks {
     per_block: f64, // probability of a change, before a block
     quick_limit: f64,
     open: Gram,
+    filled: f64, // rows of it, of which none is less before friction is known
     ring: Vec<Gram>,
     oldest: usize,
     waiting: Vec<Gram>,
@@ -141,6 +143,7 @@ impl Blocks {
             per_block: (alarms_per_hour * BLOCK_S / 3600.0).clamp(1e-12, 0.5),
             quick_limit: f_quantile(1.0, FEWEST as f64 * errors, alarms_per_hour * LOOK_S / 3600.0),
             open: Gram::default(),
+            filled: 0.0,
             ring: Vec::with_capacity(BLOCKS),
             oldest: 0,
             waiting: Vec::with_capacity(FEWEST),
@@ -200,7 +203,7 @@ impl Blocks {
         self.ring.clear();
         self.peaks.clear();
         self.waiting.clear();
-        self.open = Gram::default();
+        self.take_open();
         (self.posterior, self.frame) = (self.spring.declared_posterior(), None);
         (self.oldest, self.moved, self.located, self.skipped, self.fitted) = (0, false, true, 0, false);
         self.end_doubt();
@@ -213,9 +216,9 @@ impl Blocks {
     /// by what follows it alone.
     pub fn close_early(&mut self) {
         if self.suspected {
-            self.open = Gram::default();
+            self.take_open();
         } else if self.open.rows >= 0.5 * self.rows {
-            let block = std::mem::take(&mut self.open);
+            let block = self.take_open();
             self.close(block);
         }
         self.quick = 0.0;
@@ -265,59 +268,11 @@ impl Blocks {
         self.frame.is_some() && (self.ring.len() >= FEWEST || self.carried.is_some() || self.fitted)
     }
 
-    /// One row, and the share of it in which the motor stood; what happened where it fills a block.
-    pub fn add(&mut self, row: &Row, resting: f64) -> Option<Closed> {
-        let weight = self.weight(resting);
-        let row = &row.map(|value| weight.sqrt() * value);
-        if self.follow() {
-            return Some(Closed::Reformed);
-        }
-        let settled = self.doubting || self.skipped == 0;
-        if settled && self.is_reference() {
-            let left = dot(row, &self.residual);
-            self.quick += (self.period / LOOK_S).min(1.0) * (left * left - self.quick);
-            if !self.doubting && self.is_beyond(row) {
-                return Some(self.begin_doubt());
-            }
-            self.peak = self.peak.max(self.quick);
-        }
-        if self.skipped > 0 {
-            self.skipped -= 1;
-            return None;
-        }
-        self.open.add_row(row);
-        self.open.rows += weight - 1.0;
-        if self.open.rows < self.rows {
-            return None;
-        }
-        let block = std::mem::take(&mut self.open);
-        Some(self.close(block))
-    }
-
-    /// What a row tells beside others: dry friction at rest is anything up to what it is in motion.
-    fn weight(&self, resting: f64) -> f64 {
-        let Some(known) = self.posterior.as_ref().filter(|_| self.is_reference()) else { return 1.0 };
-        let open = (resting * (known.x[DRY] + self.at_rest)).powi(2);
-        if open > 0.0 { self.noise.variance / (self.noise.variance + open) } else { 1.0 }
-    }
-
-    /// Whether the latest rows are neither noise, nor as large as what explained blocks have held, nor uncertain.
-    fn is_beyond(&self, row: &Row) -> bool {
-        let usual = self.quick_limit * self.readings.white.max(self.own * self.own);
-        if self.quick <= usual {
-            return false;
-        }
-        let held = self.peaks.iter().fold(0.0, |most: f64, peak| most.max(*peak));
-        let (Some(frame), Some(known)) = (&self.frame, &self.posterior) else { return false };
-        let along = frame.directions.map(|direction| dot(row, &direction));
-        self.quick > usual.max(UNUSUAL * held) + self.quick_limit * known.variance_along(&along)
-    }
-
     fn close(&mut self, block: Gram) -> Closed {
         if self.frame.is_none() && self.posterior.is_some() {
             self.believe(&block);
         }
-        if let Some(odds) = self.judge(&block) {
+        if self.is_unexplained(&block) {
             if !self.doubting {
                 return self.begin_doubt();
             }
@@ -327,16 +282,15 @@ impl Blocks {
             }
             self.good = 0;
             self.waiting.push(block);
-            return self.decide(odds);
+            return self.decide();
         }
         self.good += 1;
         self.push(block);
         if self.doubting && self.good < CONVINCING {
             return Closed::Unexplained;
         }
-        if let Some(odds) = self.judge_latest() {
-            self.doubt_latest();
-            return self.decide(odds);
+        if self.doubts_latest() {
+            return self.decide();
         }
         self.end_doubt();
         self.solve();

@@ -4,7 +4,7 @@ use super::solve::ZEROS;
 use super::{Blocks, Carried, Closed};
 use crate::balance;
 use crate::causes::{Cause, Known, Noise, Odds, TABLE};
-use crate::choices::{BLOCKS, CONVINCING, EVEN, FEWEST, REST, UNUSUAL};
+use crate::choices::{BLOCKS, CONVINCING, EVEN, FEWEST, REST, TAILS, UNUSUAL};
 use crate::gram::{Gram, Set, UNKNOWNS, inverse, set};
 use crate::spring::TERMS;
 use crate::unknowns::{ASYMMETRY, CORNER, DAMPING, INERTIA, SPRING, ZERO};
@@ -13,7 +13,8 @@ impl Blocks {
     /// Something has changed: rows are of use again when the filters have forgotten what was before.
     pub(super) fn begin_doubt(&mut self) -> Closed {
         (self.doubting, self.good, self.doubted) = (true, 0, 0);
-        (self.open, self.skipped) = (Gram::default(), self.settle);
+        self.skipped = self.settle;
+        self.take_open();
         self.waiting.clear();
         Closed::Unexplained
     }
@@ -24,43 +25,35 @@ impl Blocks {
         self.suspected = false;
     }
 
-    /// What the causes say of a block, with those that wait; `None`: it is explained.
-    pub(super) fn judge(&self, block: &Gram) -> Option<Odds> {
-        let odds = self.odds_of(block)?;
-        if self.waiting.is_empty() {
-            return Some(odds);
-        }
-        let mut window = block.clone();
-        self.waiting.iter().for_each(|one| window.add(one, 1.0));
-        self.weigh(&window)
+    /// Whether the causes say of a block that something has changed.
+    pub(super) fn is_unexplained(&self, block: &Gram) -> bool {
+        self.weigh(block).is_some_and(|odds| odds.of(Cause::Nothing).probability < 0.5)
     }
 
-    /// What the causes say of the last blocks together, each of which was explained: a change may be slow.
-    pub(super) fn judge_latest(&self) -> Option<Odds> {
+    /// Whether the last blocks together, each of which was explained, show a change: it may be slow. Noise that no cause
+    /// explains is none. From where it began blocks are left out of the sum, and wait.
+    pub(super) fn doubts_latest(&mut self) -> bool {
         if self.ring.len() < 2 * FEWEST {
-            return None;
+            return false;
         }
-        let mut window = Gram::default();
-        (0..FEWEST).for_each(|k| window.add(&self.ring[self.place(k)], 1.0));
-        self.odds_of(&window)
-    }
-
-    /// The last blocks are left out of the sum, and wait.
-    pub(super) fn doubt_latest(&mut self) {
+        let mut window = self.ring[self.place(0)].clone();
+        let shows = |k: &usize| {
+            window.add(&self.ring[self.place(k - 1)], 1.0);
+            self.weigh(&window).is_some_and(|odds| {
+                odds.of(Cause::Nothing).probability + odds.of(Cause::Noise).probability < 0.5
+            })
+        };
+        let Some(began) = (2..=FEWEST).find(shows) else { return false };
         self.begin_doubt();
         self.skipped = 0;
         self.ring.rotate_left(self.oldest);
         self.peaks.rotate_left(self.oldest);
         self.oldest = 0;
-        let kept = self.ring.len() - FEWEST;
+        let kept = self.ring.len() - began;
         self.waiting.extend(self.ring.drain(kept..));
         self.peaks.truncate(kept);
         self.solve();
-    }
-
-    /// What the causes say of rows; `None`: nothing has changed.
-    fn odds_of(&self, rows: &Gram) -> Option<Odds> {
-        self.weigh(rows).filter(|odds| odds.of(Cause::Nothing).probability < 0.5)
+        true
     }
 
     /// The probability of each cause for some rows; `None`: nothing is known to hold them against.
@@ -80,27 +73,47 @@ impl Blocks {
             deflection: self.deflection,
             period_s: self.period,
         };
-        let noise = Noise { variance: self.own * self.own, ..self.noise };
+        // Each block has a level of its own.
+        let tails = TAILS * (rows.rows / self.rows).max(1.0);
+        let noise = Noise { variance: self.own * self.own, tails, ..self.noise };
         Some(known.judge(rows, &noise, self.per_block))
     }
 
-    /// The window is not explained: is it the joint that has changed, or a reading?
-    pub(super) fn decide(&mut self, odds: Odds) -> Closed {
-        self.doubted += 1;
+    /// Whether a change of the joint explains what waits.
+    fn is_change(&self, odds: &Odds) -> bool {
+        let Some(best) = odds.best(|cause| cause.entry().opens != 0) else { return false };
+        // A zero that goes on moving is nearly explained by one that has moved; a spring that bends is explained.
+        let bends = matches!(best, Cause::Stiffness | Cause::Shape | Cause::Friction);
+        let rest = if bends { REST * odds.of(Cause::Nothing).misfit } else { 0.0 };
         let of_joint: f64 =
             TABLE.iter().filter(|entry| entry.opens != 0).map(|e| odds.of(e.cause).probability).sum();
-        let best = odds.best(|cause| cause.entry().opens != 0);
-        // A zero that goes on moving is nearly explained by one that has moved; a spring that bends is explained.
-        let bends =
-            best.is_some_and(|cause| matches!(cause, Cause::Stiffness | Cause::Shape | Cause::Friction));
-        let rest = if bends { REST * odds.of(Cause::Nothing).misfit } else { 0.0 };
-        let most = UNUSUAL.max(rest);
-        let explained = best.is_some_and(|cause| odds.of(cause).misfit < most);
+        of_joint > 1.0 - EVEN && odds.of(best).misfit < UNUSUAL.max(rest)
+    }
+
+    /// What the causes say of the blocks that wait, the first of which may be of both sides of a change.
+    fn weigh_waiting(&mut self) -> Option<Odds> {
+        let mut window = Gram::default();
+        self.waiting.iter().for_each(|one| window.add(one, 1.0));
+        let odds = self.weigh(&window)?;
+        if self.waiting.len() > 2 && !self.is_change(&odds) {
+            window.add(&self.waiting[0], -1.0);
+            if let Some(later) = self.weigh(&window).filter(|later| self.is_change(later)) {
+                self.waiting.remove(0);
+                return Some(later);
+            }
+        }
+        Some(odds)
+    }
+
+    /// What waits is not explained: is it the joint that has changed, or a reading?
+    pub(super) fn decide(&mut self) -> Closed {
+        self.doubted += 1;
+        let Some(odds) = self.weigh_waiting() else { return Closed::Unexplained };
         self.odds = Some(odds);
         if self.spoilt {
             self.waiting.clear(); // samples that could not be used were among them: no joint is like that
         }
-        if self.waiting.len() >= 2 && of_joint > 1.0 - EVEN && explained && !self.is_unconfirmed() {
+        if self.waiting.len() >= 2 && self.is_change(&odds) && !self.is_unconfirmed() {
             // All that the window does not tell apart is open.
             let likely = odds.likely(|cause| cause.entry().opens != 0);
             let opens = TABLE.iter().zip(likely).filter(|(_, likely)| *likely).map(|(entry, _)| entry.opens);

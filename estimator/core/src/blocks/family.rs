@@ -3,7 +3,7 @@
 use super::Blocks;
 use crate::balance::Balance;
 use crate::choices::{EXACT, MARGIN, REACHED, SURE};
-use crate::gram::{Gram, Row, set};
+use crate::gram::{Row, set};
 use crate::laws::Law;
 use crate::spring::{Family, NODES, Projection};
 use crate::unknowns::{CORNER, SPRING, ZERO};
@@ -83,7 +83,8 @@ impl Blocks {
         }
         self.ring.clear();
         self.peaks.clear();
-        (self.oldest, self.open, self.skipped) = (0, Gram::default(), self.settle);
+        (self.oldest, self.skipped) = (0, self.settle);
+        self.take_open();
         self.fit_projection();
         self.restate();
         true

@@ -80,8 +80,9 @@ pub struct Balance {
     curve: Lanes<4, CURVE>,
     formed: Lanes<4, FORMED>,
     effects: Formed,
-    resting: Formed, // share in which dry friction may be anything
-    waves: [f64; 2], // sin q and cos q
+    elastic: Channel, // declared effects that depend on the deflection alone, as the spring's columns
+    resting: Formed,  // share in which dry friction may be anything
+    waves: [f64; 2],  // sin q and cos q
     stops: [f64; 3],
     last: f64, // φ that the stops have followed
     low: f64,
@@ -102,6 +103,7 @@ impl Balance {
             curve: Lanes::rest([0.0; CURVE]),
             formed: Lanes::rest([0.0; FORMED]),
             effects: Formed::default(),
+            elastic: Channel::rest(0.0),
             resting: Formed::default(),
             waves: [0.0; 2],
             stops: [0.0; 3],
@@ -127,7 +129,8 @@ impl Balance {
         self.position = Channel::rest(theta);
         self.torque = Channel::rest(torque);
         self.formed = Lanes::rest([0.0; FORMED]);
-        (self.effects, self.resting) = (Formed::default(), Formed::default());
+        (self.effects, self.elastic) = (Formed::default(), Channel::rest(0.0));
+        self.resting = Formed::default();
         self.rest_curve(phi);
     }
 
@@ -233,7 +236,7 @@ impl Balance {
         factors
     }
 
-    /// One period. `effect`: torque of the declared effects, N·m.
+    /// One period. `declared`: torque of the effects but for the elastic ones, and that of these, N·m.
     pub fn feed(
         &mut self,
         filters: &Filters,
@@ -241,11 +244,12 @@ impl Balance {
         phi: f64,
         torque: f64,
         link: &Channel,
-        effect: f64,
+        declared: (f64, f64),
     ) {
         self.position.smooth(filters, theta);
         self.torque.held(filters, torque);
-        self.effects.pass(filters, effect);
+        self.effects.pass(filters, declared.0);
+        self.elastic.smooth(filters, declared.1);
         if self.size.deflection == 0.0 {
             return;
         }
@@ -285,7 +289,7 @@ impl Balance {
     pub fn row(&self) -> Row {
         let mut row: Row = [0.0; COLUMNS];
         let [torque, rate, second, _] = self.torque.main;
-        (row[TORQUE], row[TORQUE_RATE], row[TORQUE_SECOND]) = (torque - self.effects.main[0], rate, second);
+        (row[TORQUE], row[TORQUE_RATE], row[TORQUE_SECOND]) = (torque - self.declared()[0], rate, second);
         row[ACCELERATION] = self.position.main[2];
         row[VELOCITY] = self.position.main[1];
         row[OFFSET] = 1.0;
@@ -360,8 +364,12 @@ impl Balance {
 
     /// Filtered θ and the filtered declared effects, with their derivatives.
     #[must_use]
-    pub fn filtered(&self) -> (&[f64; 4], &[f64; 4]) {
-        (&self.position.main, &self.effects.main)
+    pub fn filtered(&self) -> (&[f64; 4], [f64; 4]) {
+        (&self.position.main, self.declared())
+    }
+
+    fn declared(&self) -> [f64; 4] {
+        std::array::from_fn(|k| self.effects.main[k] - self.elastic.main[k])
     }
 
     /// Lightly filtered θ and its derivatives.

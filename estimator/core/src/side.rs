@@ -233,8 +233,8 @@ impl Side {
             self.blocks.grow(&factors, &self.balance);
             self.judge();
         }
-        self.feed_effects(link, time);
-        self.balance.feed(filters, theta, phi, torque, link, self.effect);
+        let formed = self.feed_effects(link, time);
+        self.balance.feed(filters, theta, phi, torque, link, (formed, self.effects.spring(phi).0));
         self.followed_s -= self.period;
         self.held_s += self.period;
         if !self.rigid {
@@ -245,10 +245,10 @@ impl Side {
         }
     }
 
-    /// The declared effects at this moment, from lightly filtered signals.
-    fn feed_effects(&mut self, link: &Channel, time: f64) {
+    /// The declared effects at this moment, from lightly filtered signals; returned without the elastic ones.
+    fn feed_effects(&mut self, link: &Channel, time: f64) -> f64 {
         if self.effects.is_empty() {
-            return;
+            return 0.0;
         }
         let light = *self.balance.light();
         let phi = link.light[0] - light[0];
@@ -269,6 +269,7 @@ impl Side {
         };
         let (motor, transmission) = self.effects.balance(&c, self.period);
         (self.effect, self.transmitted) = (motor - transmission, transmission);
+        self.effect + self.effects.spring(phi).0
     }
 
     /// Does the motion reveal the stiffness? `gain`: standard deviation of the deflection's rate.

@@ -47,9 +47,8 @@ impl Blocks {
     fn weight(&self, row: &Row, resting: f64) -> f64 {
         let known = self.posterior.as_ref().filter(|_| self.is_reference());
         let open = known.map_or(self.priors.coulomb_friction / EARLY, |known| {
-            let of_load: f64 =
-                LOAD.zip(balance::SPRING).map(|(share, spring)| (known.x[share] * row[spring]).abs()).sum();
-            (known.x[DRY] + self.at_rest + of_load) / self.noise.variance.sqrt()
+            let of_load = LOAD.zip(balance::SPRING).map(|(found, spring)| known.x[found] * row[spring].abs());
+            (known.x[DRY] + of_load.sum::<f64>() + self.at_rest) / self.noise.variance.sqrt()
         });
         (1.0 + (resting * open).powi(2)).recip()
     }

@@ -237,12 +237,22 @@ def test_a_change_is_found_beside_friction_that_nobody_declared(name):
     assert not np.any(kit.wrong(estimates, moved.stiffness_nm_rad)[13500:])
 
 
-def test_friction_of_the_load_that_nobody_declared_is_no_change():
-    """Its sign is anything at rest, as that of other friction is: what blocks leave there comes in bursts."""
-    lost = make("back_driving_loss", {"coefficient": 0.3}, 0)
-    moved = kit.motion("constant", 16.0, effects=[lost])
-    estimates, estimator = kit.play(kit.declared("constant"), moved.samples)
-    assert estimator.undeclared()[0] == ["load_dependent_friction"]
+@pytest.mark.parametrize(
+    ("name", "effect", "parameters", "declared"),
+    [
+        ("constant", "back_driving_loss", {"coefficient": 0.3}, False),
+        ("quadratic", "load_dependent_friction", {"coefficient": 0.1, "smoothing_rad_s": 0.01}, True),
+    ],
+)
+def test_friction_of_the_load_is_no_change(name, effect, parameters, declared):
+    """Its sign is anything at rest, as that of other friction is, found or declared: what blocks leave comes in bursts."""
+    moved = kit.motion(name, 16.0, seed=1, effects=[make(effect, parameters, 0)])
+    joint = kit.declared(name)
+    if declared:
+        known = Effect(name=effect, parameters=parameters)
+        joint = replace(joint, motors=(replace(joint.motors[0], effects=(known,)),))
+    estimates, estimator = kit.play(joint, moved.samples)
+    assert ("load_dependent_friction" in estimator.undeclared()[0]) == (not declared)
     assert not np.any(estimates.status & Status.CHANGED)
 
 

@@ -6,6 +6,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::choices::{FAR, GROWN, SLOW};
+use crate::effects::Declared;
 use crate::gram::{COLUMNS, Gram, Row};
 use crate::signals::{Channel, Filters, Formed, Lanes};
 use crate::spring::{Family, TERMS};
@@ -80,9 +81,9 @@ pub struct Balance {
     curve: Lanes<4, CURVE>,
     formed: Lanes<4, FORMED>,
     effects: Formed,
-    elastic: Channel, // declared effects that depend on the deflection alone, as the spring's columns
-    resting: Formed,  // share in which dry friction may be anything
-    waves: [f64; 2],  // sin q and cos q
+    elastic: Channel,     // declared elastic effects, filtered as the spring's columns
+    resting: [Formed; 2], // share in which dry friction may be anything, and what that is of the declared one
+    waves: [f64; 2],      // sin q and cos q
     stops: [f64; 3],
     last: f64, // φ that the stops have followed
     low: f64,
@@ -104,7 +105,7 @@ impl Balance {
             formed: Lanes::rest([0.0; FORMED]),
             effects: Formed::default(),
             elastic: Channel::rest(0.0),
-            resting: Formed::default(),
+            resting: [Formed::default(); 2],
             waves: [0.0; 2],
             stops: [0.0; 3],
             last: 0.0,
@@ -130,7 +131,7 @@ impl Balance {
         self.torque = Channel::rest(torque);
         self.formed = Lanes::rest([0.0; FORMED]);
         (self.effects, self.elastic) = (Formed::default(), Channel::rest(0.0));
-        self.resting = Formed::default();
+        self.resting = [Formed::default(); 2];
         self.rest_curve(phi);
     }
 
@@ -236,7 +237,7 @@ impl Balance {
         factors
     }
 
-    /// One period. `declared`: torque of the effects but for the elastic ones, and that of these, N·m.
+    /// One period.
     pub fn feed(
         &mut self,
         filters: &Filters,
@@ -244,12 +245,12 @@ impl Balance {
         phi: f64,
         torque: f64,
         link: &Channel,
-        declared: (f64, f64),
+        declared: &Declared,
     ) {
         self.position.smooth(filters, theta);
         self.torque.held(filters, torque);
-        self.effects.pass(filters, declared.0);
-        self.elastic.smooth(filters, declared.1);
+        self.effects.pass(filters, declared.formed);
+        self.elastic.smooth(filters, declared.elastic);
         if self.size.deflection == 0.0 {
             return;
         }
@@ -264,7 +265,9 @@ impl Balance {
         let [first, second] = [slopes[TERMS], slopes[TERMS + 1]];
         let speed = (SLOW * self.size.speed).max(f64::MIN_POSITIVE);
         let sign = (rate / speed).tanh();
-        self.resting.pass(filters, 1.0 - sign * sign);
+        let resting = 1.0 - sign * sign;
+        self.resting[0].pass(filters, resting);
+        self.resting[1].pass(filters, resting * declared.at_rest);
         let step = (phi - self.last) / self.size.range.max(f64::MIN_POSITIVE);
         self.last = phi;
         for (stop, width) in self.stops.iter_mut().zip(STOP_WIDTHS) {
@@ -306,10 +309,11 @@ impl Balance {
         row
     }
 
-    /// The share of a row, 0 to 1, in which the motor stood: there dry friction is anything up to what it is in motion.
+    /// The share of a row, 0 to 1, in which the motor stood, and the declared dry friction in it, N·m: there it is anything
+    /// up to what it is in motion.
     #[must_use]
-    pub fn resting(&self) -> f64 {
-        self.resting.main[0]
+    pub fn resting(&self) -> [f64; 2] {
+        self.resting.map(|one| one.main[0])
     }
 
     /// What the columns of memory and of a free curve are at a deflection: (torque, stiffness) by column.

@@ -13,7 +13,6 @@ use crate::balance;
 use crate::causes::{Noise, Odds};
 use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, TAILS};
 use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, inverse};
-use crate::library::Element;
 use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection};
@@ -62,7 +61,6 @@ pub struct Readings {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Blocks {
     motor: Motor,
-    at_rest: f64, // dry friction that is declared, N·m
     priors: Priors,
     period: f64,
     rows: f64,
@@ -70,7 +68,7 @@ pub struct Blocks {
     per_block: f64, // probability of a change, before a block
     quick_limit: f64,
     open: Gram,
-    filled: f64, // rows of it, of which none is less before friction is known
+    filled: f64, // rows of it; before friction is known, what of them is motion
     ring: Vec<Gram>,
     oldest: usize,
     waiting: Vec<Gram>,
@@ -135,7 +133,6 @@ impl Blocks {
         let spring = Spring::new(motor);
         Blocks {
             motor: motor.clone(),
-            at_rest: motor.effects.iter().map(Element::at_rest).sum(),
             priors: *priors,
             period: period_s,
             rows,

@@ -46,6 +46,19 @@ impl Sum {
     }
 }
 
+/// What the effects of a motor and its transmission do at a moment, N·m.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+pub struct Declared {
+    /// x_motor − x_transmission of eq 5, without the elastic ones.
+    pub formed: f64,
+    /// What depends on the deflection alone: part of what the transmission transmits.
+    pub elastic: f64,
+    /// x_transmission.
+    pub transmission: f64,
+    /// Dry friction of the motor that is open at rest.
+    pub at_rest: f64,
+}
+
 /// The effects of one motor and its transmission.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct MotorEffects {
@@ -97,9 +110,16 @@ impl MotorEffects {
         self.motor.is_empty() && self.transmission.is_empty()
     }
 
-    /// x_motor and x_transmission of eq 5.
-    pub fn balance(&mut self, c: &Coordinates, period_s: f64) -> (f64, f64) {
-        (self.motor.torque(c, period_s), self.transmission.torque(c, period_s))
+    /// What they do at a moment, from filtered signals, and the elastic ones at φ as it is read.
+    pub fn balance(&mut self, c: &Coordinates, phi: f64, period_s: f64) -> Declared {
+        let (motor, transmission) = (self.motor.torque(c, period_s), self.transmission.torque(c, period_s));
+        let friction = self.motor.elements.iter().filter(|_| c.sane());
+        Declared {
+            formed: motor - transmission + self.spring(c.deflection).0,
+            elastic: self.spring(phi).0,
+            transmission,
+            at_rest: friction.map(|(element, _)| element.at_rest(c)).sum(),
+        }
     }
 
     /// (torque, stiffness) of what depends on the deflection alone: part of what the transmission transmits.

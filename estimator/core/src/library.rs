@@ -300,12 +300,12 @@ impl Element {
         if self.kind.terms() == 2 { weighted + self.values[1] * terms[1] } else { weighted }
     }
 
-    /// Dry friction of a motor, N·m, that may hold it at rest by anything up to this; 0 of what has none.
+    /// Dry friction of a motor, N·m, that may hold it at rest under this load by anything up to this; 0 of what has none.
     #[must_use]
-    pub fn at_rest(&self) -> f64 {
+    pub fn at_rest(&self, c: &Coordinates) -> f64 {
         let Some(place) = table::smoothing(self.kind) else { return 0.0 };
         let sliding = 3.0 * self.values[place]; // tanh 3 is 0.995: its sign has changed
-        let at = |velocity| self.torque(&Coordinates { velocity, ..Coordinates::default() }).abs();
+        let at = |velocity| self.torque(&Coordinates { velocity, ..*c }).abs();
         at(sliding).max(at(-sliding))
     }
 

@@ -9,7 +9,7 @@ use crate::balance::Balance;
 use crate::blocks::{Blocks, Closed, Readings};
 use crate::choices::{AHEAD_S, GROWN, REACHED, SAID_S, SETTLED, SURE};
 use crate::deflection::{AT_REST, DeflectionFilter, Motion, Tuning};
-use crate::effects::{Coordinates, MotorEffects};
+use crate::effects::{Coordinates, Declared, MotorEffects};
 use crate::model::Motor;
 use crate::settings::Priors;
 use crate::signals::{Channel, Excitation, Filters};
@@ -59,8 +59,7 @@ pub struct Side {
     /// What has been learned.
     pub blocks: Blocks,
     effects: MotorEffects,
-    effect: f64,      // x_motor − x_transmission
-    transmitted: f64, // x_transmission
+    declared: Declared, // what they do at this moment
     excitation: Excitation,
     /// Whether the motion reveals the stiffness.
     pub excited: bool,
@@ -109,8 +108,7 @@ impl Side {
             stiffness: 0.0,
             blocks,
             effects,
-            effect: 0.0,
-            transmitted: 0.0,
+            declared: Declared::default(),
             excitation: Excitation::default(),
             excited: false,
             held_s: 0.0,
@@ -133,7 +131,8 @@ impl Side {
         self.effects.motor.reset();
         self.effects.transmission.reset();
         self.excitation = Excitation::default();
-        (self.effect, self.transmitted, self.acting, self.stiffness) = (0.0, 0.0, 0.0, 0.0);
+        self.declared = Declared::default();
+        (self.acting, self.stiffness) = (0.0, 0.0);
         (self.excited, self.held_s, self.doubtful) = (false, 0.0, false);
         (self.followed_s, self.unconfirmed_s, self.renewed) = (0.0, 0.0, false);
         self.judge();
@@ -233,22 +232,26 @@ impl Side {
             self.blocks.grow(&factors, &self.balance);
             self.judge();
         }
-        let formed = self.feed_effects(link, time);
-        self.balance.feed(filters, theta, phi, torque, link, (formed, self.effects.spring(phi).0));
+        self.feed_effects(phi, link, time);
+        self.balance.feed(filters, theta, phi, torque, link, &self.declared);
         self.followed_s -= self.period;
         self.held_s += self.period;
         if !self.rigid {
             let late_s = self.blocks.torque_lateness().0;
             let late = last.torque[i] + late_s * self.balance.light_torque()[1];
-            self.deflection.update(theta, phi, late + self.acting - self.effect);
+            self.deflection.update(
+                theta,
+                phi,
+                late + self.acting - self.declared.formed + self.declared.elastic,
+            );
             self.balance.observe(phi, usable && can_be);
         }
     }
 
-    /// The declared effects at this moment, from lightly filtered signals; returned without the elastic ones.
-    fn feed_effects(&mut self, link: &Channel, time: f64) -> f64 {
+    /// The declared effects at this moment.
+    fn feed_effects(&mut self, read_phi: f64, link: &Channel, time: f64) {
         if self.effects.is_empty() {
-            return 0.0;
+            return;
         }
         let light = *self.balance.light();
         let phi = link.light[0] - light[0];
@@ -267,9 +270,7 @@ impl Side {
             time,
             ..Coordinates::default()
         };
-        let (motor, transmission) = self.effects.balance(&c, self.period);
-        (self.effect, self.transmitted) = (motor - transmission, transmission);
-        self.effect + self.effects.spring(phi).0
+        self.declared = self.effects.balance(&c, read_phi, self.period);
     }
 
     /// Does the motion reveal the stiffness? `gain`: standard deviation of the deflection's rate.

@@ -39,9 +39,9 @@ impl Blocks {
         let mut window = self.ring[self.place(0)].clone();
         let shows = |k: &usize| {
             window.add(&self.ring[self.place(k - 1)], 1.0);
-            let noise = |odds: &Odds| if *k < FEWEST { odds.of(Cause::Noise).probability } else { 0.0 };
-            let odds = self.weigh(&window);
-            odds.is_some_and(|odds| odds.of(Cause::Nothing).probability + noise(&odds) < 0.5)
+            self.weigh(&window).is_some_and(|odds| {
+                odds.of(Cause::Nothing).probability + odds.of(Cause::Noise).probability < 0.5
+            })
         };
         let Some(began) = (2..=FEWEST).find(shows) else { return false };
         self.begin_doubt();

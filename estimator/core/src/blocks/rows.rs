@@ -7,8 +7,9 @@ use crate::gram::{Gram, Row, dot};
 use crate::unknowns::{DRY, LOAD};
 
 impl Blocks {
-    /// One row, and the share of it in which the motor stood; what happened where it fills a block.
-    pub fn add(&mut self, row: &Row, resting: f64) -> Option<Closed> {
+    /// One row, and how much of it is open as the motor stood ([`balance::Balance::resting`]); what happened where it fills a
+    /// block.
+    pub fn add(&mut self, row: &Row, resting: [f64; 2]) -> Option<Closed> {
         let weight = self.weight(row, resting);
         let row = &row.map(|value| weight.sqrt() * value);
         if self.follow() {
@@ -29,7 +30,7 @@ impl Blocks {
         }
         self.open.add_row(row);
         self.open.rows += weight - 1.0;
-        self.filled += if self.is_reference() { weight } else { 1.0 };
+        self.filled += if self.is_reference() { weight } else { 1.0 - resting[0] };
         if self.filled < self.rows {
             return None;
         }
@@ -44,13 +45,14 @@ impl Blocks {
 
     /// What a row tells beside others: dry friction at rest is anything up to what it is in motion, and up to what is
     /// believed of it before rows have shown it.
-    fn weight(&self, row: &Row, resting: f64) -> f64 {
+    fn weight(&self, row: &Row, resting: [f64; 2]) -> f64 {
+        let [share, declared] = resting;
         let known = self.posterior.as_ref().filter(|_| self.is_reference());
-        let open = known.map_or(self.priors.coulomb_friction / EARLY, |known| {
+        let open = known.map_or(share * self.priors.coulomb_friction / EARLY, |known| {
             let of_load = LOAD.zip(balance::SPRING).map(|(found, spring)| known.x[found] * row[spring].abs());
-            (known.x[DRY] + of_load.sum::<f64>() + self.at_rest) / self.noise.variance.sqrt()
+            (share * (known.x[DRY] + of_load.sum::<f64>()) + declared) / self.noise.variance.sqrt()
         });
-        (1.0 + (resting * open).powi(2)).recip()
+        (1.0 + open * open).recip()
     }
 
     /// Whether the latest rows are neither noise, nor as large as what explained blocks have held, nor uncertain.

@@ -107,14 +107,15 @@ fn springs_have_the_slope_of_their_torque() {
 
 #[test]
 fn only_dry_friction_holds_a_motor_at_rest() {
+    let loaded = Coordinates { velocity: 0.3, flexibility_torque: -5.0, ..Coordinates::default() };
     for (name, values, most) in [
         ("coulomb_friction", vec![0.5, 0.01], 0.5),
         ("stribeck_friction", vec![0.4, 0.3, 10.0, 0.01], 0.7),
         ("asymmetric_friction", vec![0.3, 0.6, 0.01], 0.6),
         ("viscous_damping", vec![0.5], 0.0),
-        ("load_dependent_friction", vec![0.2, 0.01], 0.0), // without a load
+        ("load_dependent_friction", vec![0.2, 0.01], 1.0),
     ] {
-        let found = Element::new(name, &values).unwrap().at_rest();
+        let found = Element::new(name, &values).unwrap().at_rest(&loaded);
         assert!((found - most).abs() <= 0.01 * most, "{name}: {found}"); // tanh 3 is 0.995
     }
 }

@@ -125,7 +125,7 @@ impl Side {
         let variance = self.blocks.posterior.as_ref()?.variance_along(&at.by_torque);
         let (late, late_std) = self.blocks.lateness();
         Some(Carried {
-            torque: at.torque + self.transmitted,
+            torque: at.torque + self.declared.transmission,
             variance,
             skew: stiffness * late,
             skew_std: stiffness * late_std,

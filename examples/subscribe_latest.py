@@ -30,6 +30,7 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
 
 
 if __name__ == "__main__":
+    sys.stdout.reconfigure(line_buffering=True)  # a pipe or a file has every line, however it ends
     for ending in (signal.SIGINT, signal.SIGPIPE):  # Ctrl-C and `| head` end it without a traceback
         signal.signal(ending, signal.SIG_DFL)
     main(*sys.argv[1:])

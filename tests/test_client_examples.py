@@ -48,14 +48,22 @@ def test_the_python_examples_run(daemon, name, expected, more):
 
 
 def test_python_examples_end_without_a_traceback_by_ctrl_c_and_where_nobody_reads_on(daemon):
+    buffered = {
+        "PYTHONUNBUFFERED": ""
+    }  # as a user's shell: what is printed comes through a pipe all the same
     with ExitStack() as stack:  # at once: each prints a line now and then
         running = [
-            (stack.enter_context(python(EXAMPLES / f"subscribe_{name}.py", "elbow", daemon, "30")), pipe)
+            (
+                stack.enter_context(
+                    python(EXAMPLES / f"subscribe_{name}.py", "elbow", daemon, "1000", **buffered)
+                ),
+                pipe,
+            )
             for name in ("latest", "wait", "async")
             for pipe in (False, True)
         ]
         for process, pipe in running:
-            process.stdout.readline()
+            assert process.stdout.readline()
             if pipe:
                 process.stdout.close()
                 process.stdout = None

@@ -181,6 +181,13 @@ def test_a_configuration_that_cannot_be_used_is_one_line_with_its_file(tmp_path,
     assert ".rs:" not in str(error.value)
 
 
+def test_a_certificate_that_is_missing_is_one_line_with_its_key(tmp_path):
+    text = '{ transport: { link: { tls: { root_ca_certificate: "nosuch/ca.pem" } } } }'
+    (tmp_path / "mine.json5").write_text(text)
+    with pytest.raises(ZenohError, match=r"link\.tls\.root_ca_certificate: .*there is no nosuch/ca\.pem$"):
+        open_session(ZenohSection(config="mine.json5"), tmp_path)
+
+
 def test_where_a_router_was_no_daemon_takes_its_place(endpoint, router):
     with ExitStack() as stack:
         with router():

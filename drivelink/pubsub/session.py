@@ -298,11 +298,15 @@ def _read(path: Path) -> zenoh.Config:
         raise ZenohError(f"{path}: zenoh.config: expected a zenoh configuration file (JSON5), there is none")
     try:
         read_regular(path, _MOST_CONFIG_BYTES)
-        return zenoh.Config.from_file(path)
+        config = zenoh.Config.from_file(path)
     except OSError as error:
         raise ZenohError(f"{path}: zenoh.config: cannot be read: {error.strerror}") from error
     except zenoh.ZError as error:
         raise ZenohError(f"{path}: expected a zenoh configuration (JSON5): {one_line(error)}") from error
+    for key, value in json.loads(config.get_json("transport/link/tls")).items():
+        if key.endswith(("_certificate", "_private_key")) and value and not Path(value).is_file():
+            raise ZenohError(f"{path}: transport.link.tls.{key}: expected a file, there is no {value}")
+    return config
 
 
 def _open(config: zenoh.Config, rendezvous: Rendezvous | None = None) -> zenoh.Session:

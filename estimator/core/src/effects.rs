@@ -122,6 +122,15 @@ impl MotorEffects {
         }
     }
 
+    /// By how much the spring is deflected beyond φ where the gear turns unevenly, rad.
+    #[must_use]
+    pub fn kinematic_error(&self, position: f64) -> f64 {
+        let uneven =
+            self.transmission.elements.iter().filter(|(element, _)| element.kind.reaction().is_some());
+        let c = Coordinates { position, stiffness: 1.0, ..Coordinates::default() };
+        uneven.map(|(element, _)| element.torque(&c)).sum()
+    }
+
     /// (torque, stiffness) of what depends on the deflection alone: part of what the transmission transmits.
     #[must_use]
     pub fn spring(&self, phi: f64) -> (f64, f64) {

@@ -59,6 +59,7 @@ pub struct Side {
     /// What has been learned.
     pub blocks: Blocks,
     effects: MotorEffects,
+    theta: f64,         // of the last sample
     declared: Declared, // what they do at this moment
     excitation: Excitation,
     /// Whether the motion reveals the stiffness.
@@ -108,6 +109,7 @@ impl Side {
             stiffness: 0.0,
             blocks,
             effects,
+            theta: 0.0,
             declared: Declared::default(),
             excitation: Excitation::default(),
             excited: false,
@@ -232,6 +234,7 @@ impl Side {
             self.blocks.grow(&factors, &self.balance);
             self.judge();
         }
+        self.theta = theta;
         self.feed_effects(phi, link, time);
         self.balance.feed(filters, theta, phi, torque, link, &self.declared);
         self.followed_s -= self.period;

@@ -20,9 +20,10 @@ impl Side {
         if self.rigid {
             return TransmissionEstimate { flexibility_torque: left(), ..nothing };
         }
-        let phi = self.deflection.now(present);
+        let read = self.deflection.now(present);
+        let phi = read + self.effects.kinematic_error(self.theta - self.effects.offset);
         let Some(at) = self.blocks.at(phi, self.deflection.link_rate(), &self.balance) else {
-            return TransmissionEstimate { flexibility_torque: left(), deflection: phi, ..nothing };
+            return TransmissionEstimate { flexibility_torque: left(), deflection: read, ..nothing };
         };
         let more = self.effects.spring(phi);
         let stiffness = at.stiffness + more.1;
@@ -44,7 +45,7 @@ impl Side {
             flexibility_torque_std,
             stiffness,
             stiffness_std,
-            deflection: phi + self.blocks.spring.zero,
+            deflection: read + self.blocks.spring.zero,
         }
     }
 

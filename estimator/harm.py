@@ -244,7 +244,7 @@ def _blocks(replayed: list[FloatArray]) -> FloatArray:
     """(blocks, 2, 3) means of two models; squares over the samples of which both are valid."""
     both = np.stack(replayed, axis=1)
     squares = both[:, :, 1:]
-    squares[np.isnan(squares).any(axis=1, keepdims=True).repeat(2, axis=1)] = np.nan
+    both[:, :, 1:] = np.where(np.isnan(squares).any(axis=1, keepdims=True), np.nan, squares)
     parts = np.array_split(both, whole("groups"))
     return np.array([[[_mean(x) for x in model.T] for model in part.swapaxes(0, 1)] for part in parts])
 

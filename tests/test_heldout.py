@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import diagnosiskit as kit
@@ -184,6 +185,26 @@ def test_validity_that_falls_by_more_than_its_standard_error_is_harm(seen, worse
 
     monkeypatch.setattr("estimator.harm._replayed", replayed)
     assert ("estimates are valid" in str(harm(model, written, [Unseen.whole(healthy)]))) is worse
+
+
+def test_what_valid_estimates_leave_is_compared_over_the_same_samples(healthy, monkeypatch):
+    """The declared model, which is valid in the easy half alone, leaves as much there."""
+    model = kit.model()
+    law = Transmission(model="linear", parameters={"k_nm_rad": kit.STIFFNESS})
+    written = replace(model, motors=(replace(model.motors[0], transmission=law),))
+    easy = np.arange(400) % 2 == 0
+
+    def replayed(more: float) -> Callable[..., FloatArray]:
+        def of(played: JointModel, *_: object) -> FloatArray:
+            valid = easy | (played is written)
+            left = np.where(easy, 1.0 + more * (played is written), 100.0)
+            return np.column_stack((valid, np.where(valid, left, np.nan), np.full(400, np.nan)))
+
+        return of
+
+    for more, said in ((0.0, "None"), (1.0, "valid estimates leave")):
+        monkeypatch.setattr("estimator.harm._replayed", replayed(more))
+        assert said in str(harm(model, written, [Unseen.whole(healthy)]))
 
 
 def test_a_file_is_not_written_while_its_balance_leaves_more_than_the_spring_carries(healthy):

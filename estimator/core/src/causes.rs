@@ -250,26 +250,17 @@ impl Known<'_> {
     pub fn judge(&self, window: &Gram, noise: &Noise, before: f64) -> Odds {
         let scale = noise.variance * noise.correlated;
         let independent = (window.rows / noise.correlated).max(1.0);
-        let evidence = |square: f64, log_ratio: f64| {
-            let square = square.max(independent); // what is left below the noise speaks for nothing
-            -0.5 * (independent + noise.tails) * (square / noise.tails).ln_1p() + 0.5 * log_ratio
-        };
-        // No cause gains more than all that is left, and each has less than this chance.
-        let least = before.max(f64::MIN_POSITIVE).ln() + (CAUSES as f64 / (CAUSES - 1) as f64).ln();
-        let gains = |square: f64| evidence(independent, 0.0) - evidence(square, 0.0) + least > 0.0;
-        let mut odds = Odds { of: [Explanation::default(); CAUSES], log: [f64::NEG_INFINITY; CAUSES] };
-        let raw = window.quadratic(self.residual) / scale; // what is uncertain can only take from it
-        if raw > 0.0 && !gains(raw) {
-            // 0: of what is not finite
-            (odds.of[0].probability, odds.of[0].misfit) = (1.0, raw / independent);
-            return odds;
-        }
         let mut frame = self.frame.clone();
         (frame.left, frame.set) = (*self.residual, self.set);
         let reduced = frame.reduce(window);
         let mut prior = Prior { mean: [0.0; UNKNOWNS], precision: *self.precision };
         // The place of the cause's own amplitude: an unknown that is not in the set, or the last one.
         let own = (1..UNKNOWNS).rev().find(|i| self.set >> i & 1 == 0);
+        let evidence = |square: f64, log_ratio: f64| {
+            let square = square.max(independent); // what is left below the noise speaks for nothing
+            -0.5 * (independent + noise.tails) * (square / noise.tails).ln_1p() + 0.5 * log_ratio
+        };
+        let mut odds = Odds { of: [Explanation::default(); CAUSES], log: [f64::NEG_INFINITY; CAUSES] };
         let mut judged = |cause: Cause, reduced: &Reduced, set: Set, prior: &Prior, unit: f64| {
             let Some(found) = solve(reduced, set, prior, scale) else { return f64::INFINITY };
             let log_ratio = log_determinant(&prior.precision, set)
@@ -287,7 +278,9 @@ impl Known<'_> {
             square
         };
         let healthy = judged(Cause::Nothing, &reduced, self.set, &prior, 0.0);
-        if !gains(healthy) {
+        // No cause gains more than all that is left, and each has less than this chance.
+        let most = evidence(independent, 0.0) - evidence(healthy, 0.0);
+        if most + before.max(f64::MIN_POSITIVE).ln() + (CAUSES as f64 / (CAUSES - 1) as f64).ln() <= 0.0 {
             odds.of[Cause::Nothing as usize].probability = 1.0;
             return odds;
         }

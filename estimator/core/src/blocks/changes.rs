@@ -4,7 +4,7 @@ use super::solve::ZEROS;
 use super::{Blocks, Carried, Closed};
 use crate::balance;
 use crate::causes::{Cause, Known, Noise, Odds, TABLE};
-use crate::choices::{BLOCKS, CONVINCING, EVEN, FEWEST, REST, TAILS, UNUSUAL};
+use crate::choices::{BLOCKS, CONVINCING, EVEN, FEWEST, REST, UNUSUAL};
 use crate::gram::{Gram, Set, UNKNOWNS, inverse, set};
 use crate::spring::TERMS;
 use crate::unknowns::{ASYMMETRY, CORNER, DAMPING, INERTIA, SPRING, ZERO};
@@ -74,7 +74,7 @@ impl Blocks {
             period_s: self.period,
         };
         // Each block has a level of its own.
-        let tails = TAILS * (rows.rows / self.rows).max(1.0);
+        let tails = self.noise.tails * (rows.rows / self.rows).max(1.0);
         let noise = Noise { variance: self.own * self.own, tails, ..self.noise };
         Some(known.judge(rows, &noise, self.per_block))
     }

@@ -12,6 +12,7 @@ from canopenkit import Item, Slave, Wire, drive_objects, eds_text
 from rich.console import Console
 from zenohkit import free_endpoint
 
+from drivelink.canopen import scan as scanning
 from drivelink.canopen.bus import run_program
 from drivelink.canopen.guard import check_frame
 from drivelink.canopen.layout import NodeLayout, roles
@@ -20,6 +21,7 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.pdo import decode
 from drivelink.canopen.scan import _identify, listen, scan
 from drivelink.cli import main
+from drivelink.cli import new as cli_new
 from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.doctor import Report, Section, examine, examine_eds, nodes
 from drivelink.doctor.livevalues import Asked, Heard, record_of
@@ -351,3 +353,31 @@ def test_words_of_a_drive_do_not_reach_the_terminal_as_commands(capsys):
     shown = capsys.readouterr().out + str(report.as_dict())
     assert "]0;owned2J[red]servo" in shown
     assert not set("\x1b\x07\x9b\u202e") & set(shown)
+
+
+class Babbler(Slave):
+    """Answers for its device type, and to every other question with something else."""
+
+    def handle(self, cob_id, data):
+        if data[1:4] != b"\x00\x10\x00":
+            return [(cob_id - 0x80, b"\x43\xff\xff\xff" + bytes(4))] if cob_id == 0x600 + self.node else []
+        return super().handle(cob_id, data)
+
+
+def test_nodes_that_do_not_answer_what_is_asked_get_a_limited_time_and_what_was_not_asked_is_said(
+    monkeypatch, tmp_path, capsys
+):
+    wire = Wire([Babbler(node, drive_objects(node)) for node in range(1, 128)])
+    wire.shutdown = lambda: None
+    monkeypatch.setattr(scanning, "ASKED_S", 0.2)
+    monkeypatch.setattr(nodes, "open_bus", lambda _: wire)
+    report = Report()
+    nodes.examine_bus(report, parse(joint_on("babble")), Path(), 0.1)
+    said = " ".join(texts(report))
+    assert said.count("was not asked further: the time for it is over") == 2  # ours
+    assert "125 more: not in the joint file, not asked for want of time: node 1," in said
+    monkeypatch.setattr(cli_new, "open_bus", lambda _: wire)
+    path = str(tmp_path / "elbow.toml")
+    assert main(["new", path, "--scan"]) == 5
+    assert "127 nodes answer, 127 of them were not asked" in capsys.readouterr().err
+    assert not Path(path).exists()

@@ -10,6 +10,7 @@ import contextlib
 import difflib
 import errno
 import logging
+import math
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -20,7 +21,7 @@ import can
 from can.interfaces import VALID_INTERFACES
 
 from drivelink.canopen.sdo import Program, Session
-from drivelink.errors import BusError
+from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection
 
 logger = logging.getLogger(__name__)
@@ -234,6 +235,10 @@ def one_line(text: str) -> str:
     return " ".join(text.partition("Traceback (most recent call last)")[0].split())
 
 
+class OutOfTime(DriveError):  # noqa: N818 - not the drive's error
+    """A program was given up; what it had not asked by then is not known."""
+
+
 T = TypeVar("T")
 Idle = Callable[[], object]
 
@@ -276,20 +281,25 @@ def run_program(
     section: BusSection | None = None,
     *,
     idle: Idle | None = None,
+    end_s: float = math.inf,
 ) -> T:
     """Run a program to its end on a bus without another reader.
 
     Args:
         section: of the joint file, for SDO timeout and retries; None: the defaults.
         idle: called between receptions, e.g. the simulated devices' `poll` in lockstep.
+        end_s: when it is given up (`time.monotonic`).
 
     Raises:
+        OutOfTime: it was given up.
         DriveError: the program failed.
         BusError: the bus did.
     """
     section = section or BusSection()
     session = Session(program, sender(bus), timeout_s=section.sdo_timeout_s, retries=section.sdo_retries)
-    while not session.poll(time.monotonic()):
+    while not session.poll(now_s := time.monotonic()):
+        if now_s > end_s:
+            raise OutOfTime(f"node {session.asks} was not asked further: the time for it is over")
         if idle is not None:
             idle()
         message = receive(bus, 0.0 if idle is not None else POLL_S)

@@ -7,13 +7,14 @@ send heartbeat or boot-up, are found.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import can
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.bus import FrameBus, frames, received_ns, run_program, sender
+from drivelink.canopen.bus import FrameBus, OutOfTime, frames, received_ns, run_program, sender
 from drivelink.canopen.emcy import nmt_state
 from drivelink.canopen.guard import check_frame
 from drivelink.canopen.pdo import read_identity, read_optional
@@ -22,6 +23,7 @@ from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection
 from drivelink.plaintext import clean_text
 
+ASKED_S = 20.0  # for all nodes of a bus; slow adapters take 5 s for one
 _ANSWER_S = 0.3  # for the slowest node
 _LONGEST_NAME = 80  # characters of a device's name that are shown
 _GAP_S = 0.001  # between two requests: 127 of them must not fill a transmit queue
@@ -108,12 +110,36 @@ def scan(bus: FrameBus, node_ids: Iterable[int] = range(1, 128)) -> tuple[list[i
     return sorted(answered | set(traffic.heartbeats)), traffic
 
 
-def identify(bus: FrameBus, section: BusSection, node_id: int) -> FoundNode:
-    """Read identity and name of a node."""
+def shares(parts: int) -> Iterator[float]:
+    """Yield when each of so many nodes has to be asked, s (monotonic): what one leaves, the others have."""
+    end_s = time.monotonic() + ASKED_S
+    for left in range(parts, 0, -1):
+        now_s = time.monotonic()
+        yield now_s + (end_s - now_s) / left
+
+
+def identify(bus: FrameBus, section: BusSection, node_id: int, end_s: float) -> FoundNode:
+    """Read identity and name of a node.
+
+    Raises:
+        OutOfTime: it could not be asked to the end by then.
+    """
     try:
-        return run_program(_identify(node_id), bus, section)
+        return run_program(_identify(node_id), bus, section, end_s=end_s)
+    except OutOfTime:
+        raise
     except DriveError:
         return FoundNode(node_id=node_id, device_type=None)
+
+
+def identify_all(
+    bus: FrameBus, section: BusSection, node_ids: Sequence[int], end_s: float
+) -> tuple[list[FoundNode], list[int]]:
+    """Read identity and name of nodes; return them, and those that the time did not suffice for."""
+    found: list[FoundNode] = []
+    with suppress(OutOfTime):
+        found.extend(identify(bus, section, node, end_s) for node in node_ids)
+    return found, list(node_ids[len(found) :])
 
 
 def _identify(node: int) -> Program[FoundNode]:

@@ -13,6 +13,7 @@ from typing import TextIO
 from rich.console import Console
 
 from drivelink.canopen.newfile import left_open
+from drivelink.canopen.scan import ASKED_S
 from drivelink.cli import add_bus, add_number, moved
 from drivelink.doctor import examine, examine_eds
 from drivelink.doctor.livevalues import live_values
@@ -24,13 +25,14 @@ from drivelink.notice import Severity
 _EXAMINED_S = 3.0
 _AT_REST_S = 0.3  # a person waits for each of these
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   drivelink doctor                     this machine: real time, memory, CAN, zenoh
   drivelink doctor elbow.toml          also bus, nodes, mappings, units; moves nothing
   drivelink doctor elbow.toml --move   you move the joint, it says how, and ticks each sign and scale off
   drivelink doctor --eds drive.eds     before buying: what a drive can give
 
+Nodes are asked for {ASKED_S:g} s at most, however they answer; what was not asked by then is said.
 Units and signs of positions and torque are checked while the joint moves under its controller.
 """
 

@@ -19,9 +19,9 @@ import tomlkit
 
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.newfile import Answers, answers_from_bus, joint_text
-from drivelink.canopen.scan import identify, scan
+from drivelink.canopen.scan import ASKED_S, identify_all, scan, shares
 from drivelink.cli import add_number
-from drivelink.errors import DrivelinkError, UsageError
+from drivelink.errors import DriveError, DrivelinkError, UsageError
 from drivelink.files import check_target, write_whole
 from drivelink.jointfile import BusSection, parse
 
@@ -190,9 +190,14 @@ def _scanned(answers: Answers) -> Answers:
     bus = open_bus(section)
     try:
         ids, _ = scan(bus)
-        found = [identify(bus, section, node) for node in ids]
+        found, left = identify_all(bus, section, ids, next(shares(1)))
     finally:
         bus.shutdown()
+    if left:
+        raise DriveError(
+            f"{section.channel}: {len(ids)} nodes answer, {len(left)} of them were not asked what they are "
+            f"for want of time ({ASKED_S:g} s): give --node instead of --scan"
+        )
     return answers_from_bus(answers, found)
 
 

@@ -18,7 +18,7 @@ from drivelink.canopen.guard import SilentBus
 from drivelink.canopen.layout import MappedObject, Signal, roles
 from drivelink.canopen.node import NodeSurvey, survey_node
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.canopen.scan import listen
+from drivelink.canopen.scan import listen, shares
 from drivelink.canopen.sdo import Program, Read, SdoAbort
 from drivelink.doctor.machine import daemon_mapping
 from drivelink.doctor.manualcheck import Reader, Value
@@ -251,7 +251,13 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[Reader]:
     bus = open_bus(joint.bus)
     try:
         if joint.bus.configure:
-            asked = Asked([run_program(survey_node(role), bus, joint.bus) for role in roles(joint, base_dir)])
+            mine = roles(joint, base_dir)
+            asked = Asked(
+                [
+                    run_program(survey_node(role), bus, joint.bus, end_s=end_s)
+                    for role, end_s in zip(mine, shares(len(mine)), strict=True)
+                ]
+            )
             yield lambda seconds: values_of(run_program(asked.program(seconds), bus, joint.bus))
         else:
             silent = SilentBus(bus)

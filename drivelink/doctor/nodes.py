@@ -25,7 +25,7 @@ from drivelink.canopen.pdo import (
     read_optional,
     unused,
 )
-from drivelink.canopen.scan import FoundNode, Traffic, identify, listen, scan
+from drivelink.canopen.scan import FoundNode, Traffic, identify, identify_all, listen, scan, shares
 from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.datasheet import (
     asked_signals,
@@ -86,9 +86,7 @@ def _ask(
     _judge_traffic(section, traffic, joint.bus, daemons)
     mine = {role.node_id: role for role in roles(joint, base_dir)}
     others = [node for node in sorted(set(found) | set(traffic.heartbeats)) if node not in mine]
-    for node in others:
-        known = identify(bus, joint.bus, node)
-        section.info(f"node {node}", f"{_describe_node(known)}, not in the joint file")
+    ends = shares(len(mine) + 1)
     if not found:
         section.error(
             joint.bus.channel,
@@ -99,7 +97,7 @@ def _ask(
     for role in mine.values():
         if role.node_id in found:
             own = report.section(f"Node {role.node_id}")
-            survey, planned = _examine_node(own, bus, joint, role, traffic)
+            survey, planned = _examine_node(own, bus, joint, role, traffic, next(ends))
             layouts += [planned] if planned else []
             if survey is not None:
                 surveys[own.title] = survey
@@ -109,9 +107,21 @@ def _ask(
                 f"({role.key}) does not answer" + (f"; there are {_list(others)}" if others else ""),
                 f"power it, or correct {role.key}.node_id",
             )
+    _name_others(section, bus, joint.bus, others, next(ends))
     _judge_load(section, layouts, joint.bus)
     if surveys:
         _watch_motion(report, bus, joint, surveys, seconds)
+
+
+def _name_others(
+    section: Section, bus: can.BusABC, settings: BusSection, others: Sequence[int], end_s: float
+) -> None:
+    """Say what else is on the bus."""
+    found, left = identify_all(bus, settings, others, end_s)
+    for node in found:
+        section.info(f"node {node.node_id}", f"{_describe_node(node)}, not in the joint file")
+    if left:
+        section.warn(f"{len(left)} more", f"not in the joint file, not asked for want of time: {_list(left)}")
 
 
 def _watch_motion(
@@ -140,6 +150,8 @@ def _list(nodes: Sequence[int]) -> str:
 
 
 def _describe_node(node: FoundNode) -> str:
+    if node.device_type is None:
+        return node.profile
     vendor, product, revision, _ = node.identity
     maker = vendor_of(vendor).name or f"vendor 0x{vendor:X}"
     named = f"{node.name}, " if node.name else ""
@@ -147,15 +159,16 @@ def _describe_node(node: FoundNode) -> str:
 
 
 def _examine_node(
-    section: Section, bus: can.BusABC, joint: JointFile, role: Role, traffic: Traffic
+    section: Section, bus: can.BusABC, joint: JointFile, role: Role, traffic: Traffic, end_s: float
 ) -> tuple[NodeSurvey | None, NodeLayout | None]:
     """Check one node of the joint: identity, and its frames as they would be configured."""
     subject = role.subject
-    node = identify(bus, joint.bus, role.node_id)
-    state = traffic.heartbeats.get(role.node_id, "no heartbeat")
-    section.ok(subject, f"{_describe_node(node)}, {state}")
     try:
-        survey = run_program(survey_node(curious(role)), bus, joint.bus)
+        node = identify(bus, joint.bus, role.node_id, end_s)
+        state = traffic.heartbeats.get(role.node_id, "no heartbeat")
+        if node.device_type is not None:
+            section.ok(subject, f"{_describe_node(node)}, {state}")
+        survey = run_program(survey_node(curious(role)), bus, joint.bus, end_s=end_s)
     except DriveError as error:
         section.error(subject, str(error))
         return None, None

@@ -62,7 +62,7 @@ PROTECTIONS = [
         ("carried joint files open nothing", "recording/mapping.py", "joint=contained(jointfile.parse(text, name))", "joint=jointfile.parse(text, name)", f"{LIMITS} -k opens_nothing"),
         ("words as plain text", "plaintext.py", '    return "" if unicodedata.category(character) in _UNSHOWABLE else character', "    return character", "tests/test_status.py -k plain_text"),
         ("rate of a source", "daemon/status.py", "len(kinds) >= self._KINDS", "False", "tests/test_status.py -k rate"),
-        ("rate of all lines", "daemon/status.py", "if self._lines <= self._LINES:", "if True:", "tests/test_status.py -k rate"),
+        ("rate of all lines", "daemon/status.py", "if window.lines <= self._LINES:", "if True:", "tests/test_status.py -k rate"),
         ("frames that may be sent", "canopen/guard.py", "    raise ForbiddenFrameError(", "    return\n    raise ForbiddenFrameError(", "tests/test_never_moves.py tests/test_canopen_sdo.py"),
         ("a passive daemon sends nothing", "canopen/guard.py", "        raise BusError(", "        return self.inner.send(message)\n        raise BusError(", "tests/test_canopen_sdo.py"),
         ("stored parameters", "canopen/passivenode.py", "address[0] in _STORE_OR_RESTORE", "False", f"{FOLLOWING} tests/test_canopen_passive.py"),

@@ -371,14 +371,18 @@ def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_o
         assert (first["state"], first["estimates"]) == ("running", 300)
         assert (second["state"], second["estimates"]) == ("fault", 100)
         assert any("wrist: no estimates since ZeroDivisionError" in c for c in second["conditions"])
-        made.events.begin("missing 11", "node 11: frames are missing")
-        made.events.begin("missing 1", "node 1: frames are missing")
+        made.events.of("wrist").begin("missing 11", "node 11: frames are missing")
+        made.events.of("elbow").begin("missing 1", "node 1: frames are missing")
+        made.events.of("elbow").report("wrist: is what the elbow says")
+        made.loop.on_fault("wrist", ValueError("of the wrist"))
         made.events.report("the transmit queue is full")
         for document, own, other in zip(made.documents(), (1, 11), (11, 1), strict=True):
             said = document["conditions"] + [event["text"] for event in document["events"]]
             assert f"node {own}: frames are missing" in said and "the transmit queue is full" in said
             assert f"node {other}: frames are missing" not in said
             assert any("wrist: no estimates" in text for text in said) is (own == 11)
+            assert ("wrist: is what the elbow says" in said) is (own == 1)
+            assert ("wrist: ValueError: of the wrist" in said) is (own == 11)
         assert len(collector.estimates) == 199  # one for each cycle after that of the exception
         assert [e.sequence for e, _ in collector.estimates] == list(range(100, 299))
         assert all(e.status & Status.STALE and not e.status & Status.VALID for e, _ in collector.estimates)

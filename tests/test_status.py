@@ -26,7 +26,8 @@ def events(clock, caplog):
 @pytest.fixture
 def supervisor(events):
     made = Supervisor.__new__(Supervisor)
-    made._events = events
+    made._events, made._joint_events = events, {"elbow": events.of("elbow")}
+    made._nodes = dict.fromkeys((1, 2), SimpleNamespace(loop_joint=SimpleNamespace(name="elbow")))
     return made
 
 
@@ -114,21 +115,21 @@ def test_words_of_a_drive_are_plain_text(events, caplog):
     assert PlainFormatter("%(message)s").format(record) == "a [2Jb"
 
 
-def alarmed(watch, status, residual_nm, location="", floor_nm=(0.03,)):
+def alarmed(watch, events, status, residual_nm, location="", floor_nm=(0.03,)):
     described = {"residual_nm": residual_nm, "floor_nm": list(floor_nm), "location": location}
     monitor = SimpleNamespace(describe=lambda: described)
     pipeline = SimpleNamespace(status=int(status), model_monitor=monitor)
-    watch._check_model(SimpleNamespace(name="elbow", pipeline=pipeline))
+    watch._check_model(SimpleNamespace(name="elbow", pipeline=pipeline), events)
 
 
 def test_a_model_alarm_that_flickers_is_counted_whatever_its_residual(events, caplog):
-    watch = JointWatch(events, lambda _joint: None)
+    watch = JointWatch(lambda _joint: None)
     for k in range(1000):
-        alarmed(watch, Status.VALID if k % 2 else Status.MODEL_ALARM, [1e-4 * k])
+        alarmed(watch, events, Status.VALID if k % 2 else Status.MODEL_ALARM, [1e-4 * k])
     assert len(caplog.records) == 2
     assert [event["count"] for event in events.recent()] == [500, 500]
     assert "3.3 times its baseline" in events.recent()[0]["text"]
-    alarmed(watch, Status.MODEL_ALARM, [14.4])
+    alarmed(watch, events, Status.MODEL_ALARM, [14.4])
     assert "is 480 times its baseline" in events.recent()[0]["text"]
 
 
@@ -144,11 +145,11 @@ def test_emergencies_with_other_bytes_of_the_maker_and_faults_of_one_kind_in_one
 
 
 def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(events, caplog):
-    watch = JointWatch(events, lambda _joint: None)
+    watch = JointWatch(lambda _joint: None)
     for status in (Status.VALID, Status.VALID | Status.MODEL_ALARM, Status.MODEL_ALARM):
-        alarmed(watch, status, [0.09, 0.01], "transmission", (0.03, 0.02))
+        alarmed(watch, events, status, [0.09, 0.01], "transmission", (0.03, 0.02))
     for _ in range(2):
-        alarmed(watch, Status.VALID, [0.02, 0.01], "", (0.03, 0.02))
+        alarmed(watch, events, Status.VALID, [0.02, 0.01], "", (0.03, 0.02))
     begun, over = caplog.messages
     said = "elbow: model alarm: the residual is 3.0 times its baseline, likely at the transmission"
     assert begun.startswith(said) and "drivelink diagnose" in begun

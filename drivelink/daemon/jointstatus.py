@@ -45,7 +45,7 @@ class JointStatus:
         self._loop = loop
         self._loop_joint = loop_joint
         self._supervisor = supervisor
-        self._events = events
+        self._events = events.of(loop_joint.name)
         self._bus_load = bus_load
         self._started_s = time.monotonic()
         self._before = (self._started_s, 0, time.process_time())
@@ -75,7 +75,6 @@ class JointStatus:
             state: "starting" or "stopped"; default: determined from the loop.
         """
         loop, loop_joint, events = self._loop, self._loop_joint, self._events
-        others = self._supervisor.others(loop_joint)
         now = time.monotonic()
         before_s, before_estimates, before_cpu_s = self._before
         cpu_s, elapsed_s = time.process_time(), max(now - before_s, 1e-9)
@@ -110,8 +109,8 @@ class JointStatus:
             "external": self._external(),
             "suspected": self._supervisor.contradiction(loop_joint) or self._suspicion(),
             "cross_checks": cross_checks(loop_joint.pipeline.assembler),
-            "conditions": sorted(text for text in events.active.values() if not text.startswith(others)),
-            "events": [event for event in events.recent() if not event["text"].startswith(others)],
+            "conditions": sorted(events.active.values()),
+            "events": events.recent(),
         }
 
     def _state(self) -> str:

@@ -76,25 +76,24 @@ class JointWatch:
         contradiction: the reading of a joint that a second one contradicts, or None.
     """
 
-    def __init__(self, events: EventLog, contradiction: Callable[[LoopJoint], dict[str, Any] | None]) -> None:
-        self._events = events
+    def __init__(self, contradiction: Callable[[LoopJoint], dict[str, Any] | None]) -> None:
         self._contradiction = contradiction
         self._alarmed: set[str] = set()  # joints with a model alarm
 
-    def check(self, loop_joint: LoopJoint) -> None:
-        """Check for changes since the last call."""
+    def check(self, loop_joint: LoopJoint, events: EventLog) -> None:
+        """Report changes since the last call."""
         name, fault = loop_joint.name, loop_joint.fault
         text = f"{name}: no estimates since {fault}; rewrite its joint file or restart the daemon"
         over = f"{name}: estimates restart"
-        self._events.keep(f"joint {name}", bool(fault), text, over, logging.ERROR)
-        self._check_model(loop_joint)
+        events.keep(f"joint {name}", bool(fault), text, over, logging.ERROR)
+        self._check_model(loop_joint, events)
         found = self._contradiction(loop_joint)
         text = f"{name}: {found['text']}" if found is not None else ""
         over = f"{name}: no reading contradicts another"
-        self._events.keep(f"contradiction {name}", found is not None, text, over)
-        self._check_readings(loop_joint)
+        events.keep(f"contradiction {name}", found is not None, text, over)
+        self._check_readings(loop_joint, events)
 
-    def _check_model(self, loop_joint: LoopJoint) -> None:
+    def _check_model(self, loop_joint: LoopJoint, events: EventLog) -> None:
         """Report begin and end of the model alarm, its amount and what to do."""
         status = loop_joint.pipeline.status
         if status is None:
@@ -105,7 +104,7 @@ class JointWatch:
         monitor = loop_joint.pipeline.model_monitor
         if alarm:
             self._alarmed.add(loop_joint.name)
-            self._events.report(
+            events.report(
                 f"{loop_joint.name}: model alarm{residual_text(monitor)}: do not control on its numbers; "
                 "record a minute of motion, then drivelink diagnose names the effect",
                 logging.WARNING,
@@ -113,18 +112,18 @@ class JointWatch:
             )
         else:
             self._alarmed.discard(loop_joint.name)
-            self._events.report(f"{loop_joint.name}: the model alarm is over")
+            events.report(f"{loop_joint.name}: the model alarm is over")
 
-    def _check_readings(self, loop_joint: LoopJoint) -> None:
+    def _check_readings(self, loop_joint: LoopJoint, events: EventLog) -> None:
         """Report begin and end of a suspicion against a reading."""
         suspicion = (
             loop_joint.pipeline.estimator.suspicion() if loop_joint.pipeline.status is not None else None
         )
         key = f"reading {loop_joint.name}"
         if suspicion is None:
-            self._events.end(key, f"{loop_joint.name}: no reading is suspected")
+            events.end(key, f"{loop_joint.name}: no reading is suspected")
         elif suspicion["reason"] not in _BRIEF:
-            self._events.begin(key, f"{loop_joint.name}: no valid estimates; suspected: {suspicion['text']}")
+            events.begin(key, f"{loop_joint.name}: no valid estimates; suspected: {suspicion['text']}")
 
 
 def residual_text(monitor: ModelMonitor | None) -> str:

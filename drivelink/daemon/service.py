@@ -184,7 +184,9 @@ class Daemon:
         if served.path is not None:
             make: Callable[[JointFile], Built] = lambda joint: build(self._timed(joint))  # noqa: E731
             files = served.path, served.joint
-            reloader = Reloader(*files, loop_joint.pipeline, served.move, make, publish, self.events)
+            reloader = Reloader(
+                *files, loop_joint.pipeline, served.move, make, publish, self.events.of(joint.name)
+            )
             self._reloaders.append(reloader)
             housekeeping.urgent.append(reloader.step)
             housekeeping.every(_FILE_S, reloader.check)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from drivelink.plaintext import clean_text
@@ -22,11 +24,21 @@ class _Said(NamedTuple):
     repeated: int = 0
 
 
+@dataclass(slots=True)
+class _Window:
+    """A time in which lines are counted."""
+
+    began_s: float = -math.inf
+    lines: int = 0
+
+
 class EventLog:
     """Logs each event once and keeps the last ones for the status document.
 
     A condition has a key and is reported when it begins and when it ends. Repetitions within ten seconds,
     also with other numbers, are counted instead of logged; while they go on, each line holds twice as long.
+
+    An event is of one joint, or of all that share the bus: `of` returns the view of a joint.
 
     Args:
         clock: UNIX time, s.
@@ -42,20 +54,30 @@ class EventLog:
     def __init__(self, logger: logging.Logger, clock: Callable[[], float] = time.time) -> None:
         self._logger = logger
         self._clock = clock
-        self._recent: deque[dict[str, Any]] = deque(maxlen=self._KEPT)
-        self._active: dict[str, str] = {}
-        self._said: dict[str, _Said] = {}
+        self._joint = ""  # whose events are reported and shown; empty: those of all
+        self._recent: deque[tuple[str, dict[str, Any]]] = deque(maxlen=self._KEPT)  # whose, and what
+        self._active: dict[str, tuple[str, str]] = {}
+        self._said: dict[tuple[str, str], _Said] = {}
         self._sources: dict[str, tuple[float, set[str]]] = {}  # when the first of the keys came, and the keys
-        self._window_s, self._lines = -math.inf, 0
+        self._window = _Window()
+
+    def of(self, joint: str) -> EventLog:
+        """Return the log of one joint: it reports as that joint, and does not show the others' events."""
+        view = copy.copy(self)
+        view._joint = joint
+        return view
+
+    def _shown(self, joint: str) -> bool:
+        return not self._joint or joint in ("", self._joint)
 
     @property
     def active(self) -> dict[str, str]:
         """Conditions that hold now, by key."""
-        return dict(self._active)
+        return {key: text for key, (joint, text) in self._active.copy().items() if self._shown(joint)}
 
     def recent(self) -> list[dict[str, Any]]:
         """Return the last events, oldest first: {"time", "text", "count"}."""
-        return [dict(event) for event in self._recent]
+        return [dict(event) for joint, event in self._recent.copy() if self._shown(joint)]
 
     def report(self, text: str, level: int = logging.INFO, key: str = "", source: str = "") -> None:
         """Report an event.
@@ -69,7 +91,7 @@ class EventLog:
     def begin(self, key: str, text: str, level: int = logging.WARNING) -> None:
         """Report that a condition begins; while it holds, only its text is renewed."""
         begins = key not in self._active
-        self._active[key] = text
+        self._active[key] = self._joint, text
         if begins:
             self._note(f"{key} begins", text, level)
 
@@ -100,19 +122,20 @@ class EventLog:
 
     def _log(self, level: int, text: str, now: float) -> None:
         """Log a line, up to a number of lines in a time."""
-        if not 0 <= now - self._window_s < self._QUIET_S:
-            left_out, self._window_s, self._lines = self._lines - self._LINES, now, 0
+        window = self._window
+        if not 0 <= now - window.began_s < self._QUIET_S:
+            left_out, window.began_s, window.lines = window.lines - self._LINES, now, 0
             if left_out > 0:
                 self._logger.warning("%d messages were not logged: too many at a time", left_out)
-        self._lines += 1
-        if self._lines <= self._LINES:
+        window.lines += 1
+        if window.lines <= self._LINES:
             self._logger.log(level, "%s", text)
 
     def _note(self, key: str, text: str, level: int) -> None:
-        now, text = self._clock(), clean_text(text)
-        said = self._said.get(key, _Said({}, -self._QUIET_S, -self._QUIET_S, self._QUIET_S))
+        now, text, mine = self._clock(), clean_text(text), (self._joint, key)
+        said = self._said.get(mine, _Said({}, -self._QUIET_S, -self._QUIET_S, self._QUIET_S))
         if 0 <= now - said.logged_s < said.quiet_s:
-            self._said[key] = said._replace(last_s=now, repeated=said.repeated + 1)
+            self._said[mine] = said._replace(last_s=now, repeated=said.repeated + 1)
             said.event["text"] = text  # its present numbers
             said.event["count"] += 1
             return
@@ -121,7 +144,7 @@ class EventLog:
         event = {"time": now, "text": text, "count": 1}
         goes_on = 0 <= now - said.last_s < self._QUIET_S
         quiet_s = min(2.0 * said.quiet_s, self._LONGEST_S) if goes_on else self._QUIET_S
-        self._said[key] = _Said(event, now, now, quiet_s)
+        self._said[mine] = _Said(event, now, now, quiet_s)
         again = f" (logged once for {said.repeated + 1} occurrences)" if said.repeated else ""
         self._log(level, text + again, now)
-        self._recent.append(event)
+        self._recent.append((self._joint, event))

@@ -50,11 +50,12 @@ class Supervisor:
     ) -> None:
         self._loop = loop
         self._events = events
+        self._joint_events = {one.name: events.of(one.name) for one in loop.loop_joints}
         self._configurator = configurator
         self._check: ObjectCheck | None = None
         self._read_back: ReadBack | None = None
         self.bus = BusWatch(loop, events)  # watches SYNC, the bus and this machine
-        self._joints = JointWatch(events, self.contradiction)
+        self._joints = JointWatch(self.contradiction)
         loop.on_fault = self._report_fault
         self._unread = 0  # frames lost by receive overflow
         self._nodes: dict[int, WatchedNode] = {}
@@ -104,11 +105,9 @@ class Supervisor:
         now, nodes = self._loop.clock(), self._nodes.items()
         return {str(node): one.status(now) for node, one in nodes if one.loop_joint is loop_joint}
 
-    def others(self, loop_joint: LoopJoint) -> tuple[str, ...]:
-        """Return how events begin that are of other joints of the bus alone."""
-        names = [f"{one.name}:" for one in self._loop.loop_joints if one is not loop_joint]
-        nodes = [node for node, one in self._nodes.items() if one.loop_joint is not loop_joint]
-        return (*names, *(f"node {node}{sign}" for node in nodes for sign in ": "))
+    def _of(self, node: int) -> EventLog:
+        """Return where events of a node are reported: they are of its joint alone."""
+        return self._joint_events[self._nodes[node].loop_joint.name]
 
     def step(self, now_ns: int) -> None:
         """Advance running configurations."""
@@ -123,7 +122,7 @@ class Supervisor:
         for found in self._follower.sync():
             self._nodes[found.node].attempt_ns = self._loop.clock()
             text = f"{found.text}: it is configured again"
-            self._events.report(text, logging.WARNING, key=f"read back {found.node}")
+            self._of(found.node).report(text, logging.WARNING, key=f"read back {found.node}")
             self._configurator.start(found.node)
 
     def _proceed(self, now_ns: int) -> None:
@@ -137,7 +136,7 @@ class Supervisor:
                 watched.failures = 0
                 continue
             watched.failures += 1
-            self._events.begin(f"configure {node}", f"node {node} cannot be configured: {result}")
+            self._of(node).begin(f"configure {node}", f"node {node} cannot be configured: {result}")
 
     def _use(self, node: int, layout: NodeLayout) -> None:
         """At a SYNC, a layout has come into use."""
@@ -145,13 +144,13 @@ class Supervisor:
         if layout.tpdos != watched.layout.tpdos:
             self._loop.reroute()
             self._loop.source.narrow(self._loop.receive_ids())
-            self._events.report(f"node {node} has another mapping now: {_maps(layout)}")
+            self._of(node).report(f"node {node} has another mapping now: {_maps(layout)}")
         watched.layout = layout
         if isinstance(self._configurator, PassiveConfigurator):
             return
-        self._events.end(f"configure {node}")
+        self._of(node).end(f"configure {node}")
         if not watched.started:
-            self._events.report(f"node {node} is configured again and started")
+            self._of(node).report(f"node {node} is configured again and started")
         watched.started = True
 
     def check(self) -> None:
@@ -160,17 +159,17 @@ class Supervisor:
             return  # already reported; silence says nothing about the nodes now
         now = self._loop.clock()
         for node, watched in self._nodes.items():
-            watched.check_counters(self._events, now)
+            watched.check_counters(events := self._of(node), now)
             self._check_frames(node, watched, now)
-            watched.check(self._events, now)
+            watched.check(events, now)
         for loop_joint in self._loop.loop_joints:
-            self._joints.check(loop_joint)
+            self._joints.check(loop_joint, self._joint_events[loop_joint.name])
         follower = self._follower
         if isinstance(follower, PassiveFollower):
             self._check_maps(follower)
         else:
             for node, refused in follower.refused.items():
-                self._events.begin(f"configure {node}", f"node {node} cannot be configured: {refused}")
+                self._of(node).begin(f"configure {node}", f"node {node} cannot be configured: {refused}")
         self.bus.check()
 
     def _check_overflow(self) -> None:
@@ -183,17 +182,18 @@ class Supervisor:
         doubts = follower.doubts
         for node, watched in self._nodes.items():
             over = f"node {node}: its mapping is known, its frames are used"
-            self._events.keep(f"mapping {node}", node in doubts, doubts.get(node, ""), over)
+            self._of(node).keep(f"mapping {node}", node in doubts, doubts.get(node, ""), over)
             unasked = follower.unasked(node)
             if unasked > watched.unasked:
                 watched.unasked = unasked
                 text = f"node {node}: {unasked} SDO answers so far belong to no request heard: not used"
-                self._events.report(text, logging.WARNING, key=f"unasked {node}")
+                self._of(node).report(text, logging.WARNING, key=f"unasked {node}")
 
     def _report_fault(self, where: str, error: Exception) -> None:
         logger.debug("%s", where, exc_info=error)
         kind = type(error).__name__
-        self._events.report(f"{where}: {kind}: {error}", logging.ERROR, key=f"{where}: {kind}")
+        events = self._joint_events.get(where, self._events)
+        events.report(f"{where}: {kind}: {error}", logging.ERROR, key=f"{where}: {kind}")
 
     def reconfigure_all(self) -> None:
         """Configure all nodes again after a loss of the bus."""
@@ -216,7 +216,7 @@ class Supervisor:
         if counters.received != watched.received:
             watched.received, watched.seen_ns = counters.received, now
             watched.started = False
-            self._events.end(f"start {node}", f"node {node} sends its frames")
+            self._of(node).end(f"start {node}", f"node {node} sends its frames")
         lost = now - watched.seen_ns > _SILENT_NS or node in assembler.untrusted
         lost = lost or (watched.state != OPERATIONAL and now - watched.heartbeat_ns < _NS)
         # Frames without the heartbeat: another device may have been configured in its place. Asked for once.
@@ -233,7 +233,7 @@ class Supervisor:
     def _report_unstarted(self, node: int, watched: WatchedNode) -> None:
         code = watched.loop_joint.pipeline.assembler.faults.get(node)
         why = f" and EMCY 0x{code:04X}: its error may need a reset or a power cycle" if code else ""
-        self._events.begin(
+        self._of(node).begin(
             f"start {node}",
             f"node {node} is configured and was started, but sends none of its frames; "
             f"it says {nmt_state(watched.state)}{why}",
@@ -247,7 +247,7 @@ class Supervisor:
         watched.heartbeat_ns = self._loop.clock()
         state = data[0] & 0x7F
         if state == 0:  # every time: it may reboot while being configured
-            self._events.report(f"node {node} has rebooted", logging.WARNING)
+            self._of(node).report(f"node {node} has rebooted", logging.WARNING)
             watched.attempt_ns = watched.heartbeat_ns
             self._configurator.start(node)
             if isinstance(self._follower, PassiveFollower):  # its heartbeat has its default again
@@ -261,7 +261,7 @@ class Supervisor:
         if emergency is not None and not emergency.is_reset:
             node, code = cob_id - 0x080, emergency.code
             key, source = f"EMCY {node} {code}", f"EMCY {node}"
-            self._events.report(f"node {node}: {emergency}", logging.WARNING, key, source)
+            self._of(node).report(f"node {node}: {emergency}", logging.WARNING, key, source)
 
     def _answer(self, cob_id: int, data: bytes) -> None:
         now_ns = self._loop.clock()
@@ -279,7 +279,7 @@ class Supervisor:
         address = written_object(data)
         if address is not None and is_mapping(address):
             text = f"node {cob_id - 0x600}: somebody else writes its mapping: it is configured again"
-            self._events.report(text, logging.WARNING)
+            self._of(cob_id - 0x600).report(text, logging.WARNING)
 
 
 def _maps(layout: NodeLayout) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import random
 import struct
@@ -10,7 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from daemonkit import vsa_text
+from daemonkit import rig, vsa, vsa_text
 from zenohkit import make_estimate, make_external, make_sample
 
 from drivelink._core import encode_estimate, encode_external, encode_sample
@@ -18,8 +19,12 @@ from drivelink.canopen.eds import load_eds
 from drivelink.canopen.emcy import parse_emergency
 from drivelink.canopen.sdo import SdoSniffer
 from drivelink.errors import DrivelinkError
-from drivelink.jointfile import load, parse
+from drivelink.jointfile import load, load_text, parse
+from drivelink.jointfile.document import changes_to, write_model
+from drivelink.monitor.statuslines import external_doubt, status_lines, status_text
 from drivelink.pubsub import wire
+from drivelink.pubsub.feed import decode_document
+from drivelink.pubsub.publisher import describe_model
 from drivelink.recording import read
 from drivelink.recording.canlog import CAN_FORMATS
 from drivelink.recording.columns import parse_column_map
@@ -108,12 +113,47 @@ def _sdo(path: Path) -> None:
     assert len(sniffer.values) + len(sniffer.disputed) <= 2 * len(data)
 
 
+def _written_again(path: Path) -> None:
+    """As `fit --write` and `accept` do."""
+    source = load_text(path)
+    write_model(source, path.with_name("again.toml"), changes_to(source.joint.model()), force=True)
+
+
+def _views(path: Path) -> None:
+    """A document of a daemon in each role, as the views show it."""
+    document = decode_document(path.read_bytes())
+    for one in (document, document | {"schema": "drivelink.finding/1"}):
+        shown = "".join(line.plain for line in status_lines(one, 80, one, one))
+        shown += status_text(one, one, one) + external_doubt(one, valid=False)
+        assert not any(ord(c) < 32 or 0x7F <= ord(c) < 0xA0 for c in shown), repr(shown)
+
+
+def _fleet_table(path: Path) -> None:
+    from drivelink.fleet.storage import Store
+    from drivelink.fleet.table import FOLDER, read_rows
+
+    with TemporaryDirectory() as folder:
+        store = Store(folder)
+        store.write(f"{FOLDER}/part.parquet", path.read_bytes())
+        read_rows(store)
+
+
+def _table_seed() -> bytes:
+    from drivelink.fleet.table import SCHEMA, _bytes, pa
+
+    row = {"id": "a", "recording": "r.mcap", "digest": "d", "size_bytes": 1, "status": "ok"}
+    return _bytes(pa.Table.from_pylist([{**row, "written": 0, "effects": ["backlash"]}] * 3, schema=SCHEMA))
+
+
 def _of_bytes(take: Callable[[bytes], object], path: Path) -> object:
     return take(path.read_bytes())
 
 
 _TAKE: dict[str, Callable[[Path], object]] = {
     "joint file": load,
+    "written joint file": _written_again,
+    "document": _views,
+    **({"fleet table": _fleet_table} if importlib.util.find_spec("pyarrow") else {}),
     "eds": lambda path: load_eds(path, node_id=1).tpdos(),
     "column map": lambda path: parse_column_map(path.read_text(errors="replace").splitlines()),
     "mapping": _document,
@@ -132,10 +172,17 @@ def seeds(parser: str) -> tuple[bytes, ...]:
     if parser in RECORDINGS:
         with TemporaryDirectory() as folder:
             return (write_recording(Path(folder, f"r{parser}")).read_bytes(),)
-    files = {"joint file": ROOT / "drivelink" / "joints", "eds": ROOT / "sim" / "eds"}
-    if parser in files:
-        given = tuple(path.read_bytes() for path in sorted(files[parser].iterdir()))
-        return (*given, vsa_text().encode()) if parser == "joint file" else given
+    if parser == "eds":
+        return tuple(path.read_bytes() for path in sorted((ROOT / "sim" / "eds").iterdir()))
+    if parser.endswith("joint file"):
+        files = sorted((ROOT / "drivelink" / "joints").iterdir())
+        return (*(path.read_bytes() for path in files), vsa_text().encode())
+    if parser == "document":
+        with rig(joint := vsa()) as made:
+            made.run(50)
+            return json.dumps(made.status).encode(), json.dumps(describe_model(joint)).encode()
+    if parser == "fleet table":
+        return (_table_seed(),)
     node = {"node_id": 1, "motor": 0, "tpdos": [{"number": 1, "cob_id": 385, "objects": []}]}
     return {
         "column map": (b"q=link_position_rad:deg\nm=motor1_position_rad:-2.5",),
@@ -187,7 +234,9 @@ def take(parser: str, data: bytes, folder: Path) -> None:
     Raises:
         Exception: whatever a parser must not raise.
     """
-    suffix = {"joint file": ".toml", "eds": ".eds"}.get(parser, parser if parser in RECORDINGS else ".bin")
+    suffix = {"joint file": ".toml", "written joint file": ".toml", "eds": ".eds"}.get(
+        parser, parser if parser in RECORDINGS else ".bin"
+    )
     path = folder / f"r{suffix}"
     path.write_bytes(data)
     held(lambda: _TAKE[parser](path))

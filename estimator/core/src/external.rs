@@ -225,7 +225,13 @@ impl LinkMomentum {
         self.judge.reset();
         self.errors = LinkErrors::default();
         self.latest = Latest::nothing();
-        self.unsettled = self.settle;
+        (self.unsettled, self.moved) = (self.settle, false);
+    }
+
+    /// Positions may count from anywhere: q may, too, where all have moved alike and no deflection shows it.
+    pub fn lose_zero(&mut self) {
+        self.reset();
+        self.moved = true;
     }
 
     /// The filters hold something wrong.
@@ -254,7 +260,7 @@ impl LinkMomentum {
         if moved && !self.moved {
             self.errors = LinkErrors::default();
         }
-        self.moved = moved;
+        self.moved |= moved;
     }
 
     /// One period: q, what the transmissions do to the link where that is known, and τ_k where it is measured.

@@ -167,11 +167,12 @@ impl Robust {
     /// Positions may count from anywhere after this: nothing that depends on where their zeros are is known.
     pub fn lose_zeros(&mut self) {
         if self.sides.iter().all(Side::knows_nothing) {
-            return self.reset(); // as at a start: the zeros are those that are declared
+            self.reset(); // as at a start: the zeros are those that are declared
+            return self.momentum.iter_mut().for_each(LinkMomentum::lose_zero);
         }
         self.validator.lose_zeros();
         self.corrections.reset();
-        self.momentum.iter_mut().for_each(LinkMomentum::reset);
+        self.momentum.iter_mut().for_each(LinkMomentum::lose_zero);
         (self.live.begins, self.live.zeros_known, self.live.jumped) = (true, false, None);
         (self.live.rejected, self.live.refused, self.live.external, self.live.why, self.live.estimate) =
             (0, None, None, None, None);

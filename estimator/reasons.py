@@ -78,7 +78,7 @@ def reason_text(
 def percent(share: float, decimals: int) -> str:
     """Return a share of one in per cent, of four digits at most: "12.01 %", "5621 %"."""
     whole = len(f"{abs(100.0 * share):.0f}")
-    return f"{100.0 * share:.{max(0, min(decimals, 4 - whole))}f} %"
+    return f"{100.0 * share:.{max(0, min(decimals, 4 - whole))}f} %".replace("-", "−")
 
 
 def why_not_valid(status: int, estimator: Estimator) -> tuple[str, str] | None:

@@ -3,6 +3,7 @@
 python examples/subscribe_numpy.py [JOINT [ENDPOINT [SECONDS]]]
 """
 
+import signal
 import sys
 import time
 
@@ -26,4 +27,5 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback
     main(*sys.argv[1:])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -233,12 +234,19 @@ def test_ctrl_c_while_an_error_is_said_ends_without_a_traceback(monkeypatch, tmp
     assert main(["run", str(tmp_path / "nosuch.toml")]) == 130
 
 
-def test_zsh_has_its_script_and_the_manual_page_every_verb(capsys):
+def test_zsh_has_its_script_and_the_manual_page_every_verb_and_exit_status(capsys):
     assert cli.main(["completion", "zsh"]) == 0
     assert "replay" in capsys.readouterr().out
     page = (Path(__file__).parent.parent / "packaging" / "drivelink.1").read_text(encoding="utf-8")
     for verb, summary in cli.VERBS.items():
         assert f".B {verb}\n{summary.replace('-', chr(92) + '-')}\n" in page
+    reference = (Path(__file__).parent.parent / "docs" / "reference" / "commands.md").read_text(
+        encoding="utf-8"
+    )
+    statuses = re.findall(r"^\| (\d+) \| (.+) \|$", reference, re.MULTILINE)
+    assert statuses
+    for status, text in statuses:
+        assert f".B {status}\n{text.replace('`', '').replace('-', chr(92) + '-')}\n" in page
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")

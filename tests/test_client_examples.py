@@ -69,7 +69,10 @@ def test_python_examples_end_without_a_traceback_by_ctrl_c_and_where_nobody_read
                 process.stdout = None
             else:
                 process.send_signal(signal.SIGINT)
-        for process, _ in running:
+        alone = stack.enter_context(python(EXAMPLES / "subscribe_numpy.py", "nosuch", daemon, **buffered))
+        assert alone.stderr.readline()  # which joints there are: it still waits
+        alone.send_signal(signal.SIGINT)
+        for process, _ in (*running, (alone, False)):
             assert "Traceback" not in process.communicate(timeout=20)[1]
 
 
@@ -99,6 +102,12 @@ def test_the_rust_example_reads_the_golden_vectors_and_the_daemon(daemon):
     run("cargo", "build", "--locked", "--quiet", cwd=EXAMPLES / "rust")
     out = run(target / "debug" / "drivelink-subscribe", "elbow", daemon, "20", timeout=60)
     assert out.count("700.0 ± 3.0 N·m/rad, valid true, observable true") == 20
+    waiting = subprocess.Popen(
+        [target / "debug" / "drivelink-subscribe", "nosuch", daemon], stderr=subprocess.PIPE, text=True
+    )
+    with waiting:
+        assert "no estimate of nosuch" in waiting.stderr.readline()  # not silence
+        waiting.kill()
 
 
 @pytest.fixture(scope="module")

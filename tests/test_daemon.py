@@ -299,10 +299,12 @@ def test_a_joint_file_that_is_gone_or_none_leaves_the_model_as_it_is(reloadable,
     with monkeypatch.context() as broken:
         broken.setattr(reloader, "_build", lambda _joint: 1 // 0)
         taken(reloader)
-    assert made.events[-1] == "the model stays as it is: integer division or modulo by zero"
+    refused = "the model stays as it is: integer division or modulo by zero"
+    assert made.events[-1] == refused and list(made.daemon.events.active.values()) == [refused]  # till mended
     path.write_bytes(before + b"\n")
     taken(reloader)
     until(lambda: made.run(20) and made.loop_joint.pipeline.estimator is not old)
+    assert not made.daemon.events.active
 
 
 SINGLE = """

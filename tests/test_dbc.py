@@ -31,6 +31,7 @@ def test_a_recordings_frames_are_decoded_in_si(tmp_path, capsys):
         0x183, (-1500).to_bytes(4, "little", signed=True) + b"\x08\0\x27\x06"
     )
     assert decoded == {"motor1_position": pytest.approx(-1.5), "motor1_torque": -2.0, "object_6041_00": 0x627}
+    assert "(0.001,0.0)" in out.read_text()  # no -0.0
     assert main(["dbc", str(path), "--out", str(out)]) != 0  # never replaced unasked
 
 

@@ -198,6 +198,7 @@ def test_a_ctrl_c_that_a_finaliser_discards_ends_the_run_all_the_same():
         ("{recordings} --joints {joints} --scheduler tcp://127.0.0.1:1", "expected tls://HOST:PORT: without TLS anybody who reaches"),
         ("{recordings} --joints {joints} --scheduler 127.0.0.1:1", "expected tls://HOST:PORT"),
         ("{recordings} --joints {joints} --scheduler tls://127.0.0.1:1", "expected certificates in Dask's configuration"),
+        ("{recordings} --joints {joints} --scheduler bogus --insecure", "cannot be reached: missing port number"),
         ("{recordings} --joints {joints} --scheduler tcp://127.0.0.1:1 --insecure", "--scheduler tcp://127.0.0.1:1: cannot be reached"),
     ],
 )  # fmt: skip

@@ -211,11 +211,17 @@ def test_damping_zero_and_parameters_of_sure_effects_are_tested_for_changes_and_
 
 @pytest.mark.parametrize("rigid", [{}, {"model": "none", "excited": False, "deflection_offset_rad": None}])
 @pytest.mark.parametrize(
-    ("nights", "said"), [(1, "Too few recordings"), (5, "Too few recordings"), (6, "Steady.")]
+    ("nights", "state", "said"),
+    [
+        (1, "undecided", "Too few recordings"),
+        (5, "undecided", "Too few recordings"),
+        (6, "steady", "Steady."),
+    ],
 )
-def test_no_joint_is_called_steady_by_fewer_recordings_than_show_a_change(nights, said, rigid):
+def test_no_joint_is_called_steady_by_fewer_recordings_than_show_a_change(nights, state, said, rigid):
     rows = [night("elbow", k, 150.0 + 0.1 * (k % 2), []) | rigid for k in range(nights)]
-    assert sentence(*rows).startswith(said) and page(summarise(rows, 0.05))
+    (joint,) = (document := summarise(rows, 0.05))["joints"]
+    assert joint["state"] == state and joint["sentence"].startswith(said) and page(document)
 
 
 def test_a_joint_that_lacked_an_effect_in_some_nights_is_not_merely_steady():

@@ -12,11 +12,11 @@ from zenohkit import free_endpoint, joint_text, process, ready, script
 pytest.importorskip("foxglove", reason="needs the extra foxglove")
 
 
-async def listened(port):
-    """The channel of the estimates, and the first message on it."""
+async def listened(port, topic):
+    """A channel, and the first message on it."""
     import aiohttp  # takes most of a second
 
-    protocol, topic = ("foxglove.sdk.v1",), "/elbow/estimate"
+    protocol = ("foxglove.sdk.v1",)
     async with (
         aiohttp.ClientSession() as session,
         session.ws_connect(f"ws://127.0.0.1:{port}", protocols=protocol) as socket,
@@ -41,8 +41,10 @@ def test_estimates_come_live_over_a_websocket(tmp_path):
         ready(daemon)
         with process("monitor", path, "--foxglove", "--port", "0") as bridge:
             port = int(bridge.stdout.readline().rpartition(":")[2].split()[0])
-            channel, data = asyncio.run(asyncio.wait_for(listened(port), 60))
+            channel, data = asyncio.run(asyncio.wait_for(listened(port, "/elbow/estimate"), 60))
+            model = asyncio.run(asyncio.wait_for(listened(port, "/elbow/model"), 20))[1]  # published long ago
     assert json.loads(channel["schema"])["properties"]["stiffness_nm_rad"]["unit"] == "N·m/rad"
     assert struct.unpack_from("<I", data, 1) == (7,)
     estimate = json.loads(data[13:])
+    assert json.loads(model[13:])["joint"] == "elbow"
     assert estimate["stiffness_nm_rad"] == 700.0 and estimate["valid"] is True

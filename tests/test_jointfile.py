@@ -193,7 +193,8 @@ def test_a_written_file_may_be_edited_and_that_is_said(written, caplog):
     assert not caplog.messages
     written.write_text(written.read_text().replace("500.0", "600.0"))
     assert jointfile.load(written).motor[0].transmission.parameters["coefficients_nm_rad"] == (100.0, 600.0)
-    assert caplog.messages == [f"{written}: edited since drivelink wrote it: read as it is now"]
+    jointfile.load_text(written)
+    assert caplog.messages == [f"{written}: edited since drivelink wrote it: read as it is now"]  # once
     source = jointfile.load_text(written)
     for _ in range(2):  # a copy has one check line
         jointfile.write_model(source, written, {"provenance": {"recording": "s.csv"}}, force=True)

@@ -7,6 +7,7 @@ import os
 import random
 import struct
 from collections import Counter
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -25,6 +26,7 @@ from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages, recorded_cycles
 from drivelink.recording.messages import message_schema
 from drivelink.recording.playback import open_playback
+from drivelink.recording.sinks import SafeFile
 from estimator.sample import SIGMA_95, Sample, Status, TransmissionEstimate
 
 TEXT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
@@ -106,6 +108,14 @@ def check(value, schema, where):
         assert set(schema.get("required", ())) <= set(value), where
         for name, inner in schema.get("properties", {}).items():
             check(value[name], inner, f"{where}.{name}")
+
+
+def test_a_recording_of_another_joint_is_said_to_be_one_once(path, caplog):
+    arm = parse(TEXT.replace("elbow", "arm"))
+    for joint in (JOINT, arm):
+        read(path, joint)
+        open_playback(path, joint, path.parent)
+    assert caplog.messages == [f'{path}: recorded of "elbow", while the joint file is of "arm"']
 
 
 def test_an_independent_reader_finds_channels_schemas_and_messages_that_obey_them(path):
@@ -219,6 +229,14 @@ def count(path):
     if path.suffix == ".csv":
         return len(read(path, parse(TEXT + '[motor.transmission]\nmodel = "none"\n')))
     return sum(1 for _ in read_frames(path))
+
+
+def test_of_a_full_device_nothing_is_said_to_be_kept():
+    file = SafeFile(Path("/dev/full"))
+    file.write(b"a line")
+    with pytest.raises(RecordingError, match="No space left on device; nothing was written"):
+        file.sync()
+    file.close()
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".csv", ".blf"])

@@ -21,6 +21,8 @@ from drivelink.output.document import Grid, Section, show
 from drivelink.output.numbers import Units
 from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
 from drivelink.output.progress import Meter
+from estimator.diagnosis import Errors
+from estimator.reasons import percent
 
 JOINT = fleetkit.JOINT.format(name="elbow")
 
@@ -211,6 +213,19 @@ def test_the_report_says_why_another_effect_was_not_chosen(chosen, said):
     outcome = SimpleNamespace(train=SimpleNamespace(after_relative=chosen), rivals=[rival])
     why = "asymmetric friction alone leaves less: an effect with more freedom"
     assert (why in report._choice_of(outcome, [chosen])) == said
+
+
+def test_a_fall_by_many_orders_keeps_its_digits_and_what_has_no_parameters_no_table():
+    units, error = Units(linear=False), Errors(16991.2, 0.0098, 828658.0, 0.4787)
+    outcome = SimpleNamespace(
+        train=error, validation=error, effects=(), curves=(), transmissions=(), alignment={}
+    )
+    assert report._errors(outcome, units).rows[0][1:3] == ("16991 N·m, 82865800 %", "0.0098 N·m, 47.87 %")
+    assert report._parameters(outcome, units) == []
+
+
+def test_a_share_below_zero_has_the_minus_sign_of_other_numbers():
+    assert (percent(-0.3371, 1), percent(0.998, 1)) == ("−33.7 %", "99.8 %")
 
 
 @pytest.mark.slow

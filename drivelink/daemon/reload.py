@@ -58,6 +58,7 @@ class Reloader:
         self._events = events
         self._seen = self._signature()
         self._requested = False
+        self._refused = ""  # what is said of a file that is not in use
         self._next_s = -math.inf
         self._thread: threading.Thread | None = None
         self._turn = threading.Lock()  # serialises the steps of the new estimator
@@ -122,10 +123,17 @@ class Reloader:
             self._refuse_changes(joint)
             built = self._build(joint)
         except Exception as error:  # noqa: BLE001 - whatever comes of a file, the next one is read
-            self._events.report(f"the model stays as it is: {error}", logging.ERROR)
+            self._refuse(f"the model stays as it is: {error}")
             self._thread = None
             return
+        self._events.end(self._refused)
         self._follow(joint, built)
+
+    def _refuse(self, text: str) -> None:
+        """Report why the file is not in use, for as long as it is so."""
+        self._events.end(self._refused)
+        self._refused = text
+        self._events.begin(text, text, logging.ERROR)
 
     def _follow(self, joint: JointFile, built: Built) -> None:
         """Step the new estimator through the kept samples, and on until the loop takes over."""

@@ -21,6 +21,7 @@ from typing import Any, Literal
 import dask
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster, as_completed
+from distributed.comm.addressing import get_address_host_port
 from distributed.deploy.spec import close_clusters
 from distributed.scheduler import KilledWorker
 from distributed.security import Security
@@ -294,6 +295,7 @@ def _remote(address: str, insecure: bool) -> Client:
         if file and "\n" not in file and not os.access(file, os.R_OK):  # else the certificate itself
             raise FleetError(f"--scheduler {address}: {file} of Dask's configuration: cannot be read")
     try:
+        get_address_host_port(address)  # before there is a client, which would have to be closed
         return Client(address, security=security, timeout=f"{_CONNECT_S:g}s", set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         line = " ".join(str(error).split())

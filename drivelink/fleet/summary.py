@@ -162,7 +162,7 @@ def _joint(name: str, rows: list[dict[str, Any]], judged: _Judged) -> dict[str, 
     shown = {(p["report"], t["transmission"]) for t in judged["transmissions"] for p in t["series"]}
     without = unusable(rows, shown)
     gone = lost(judged["transmissions"], without)
-    state, size = _state(judged, last, gone)
+    state, size = _state(judged, rows, last, gone)
     return {
         "joint": name,
         "state": state,
@@ -186,7 +186,21 @@ STATES = {"lost": 5.0, "changing": 4.0, "finding": 3.0, "unread": 2.0, "undecide
 LOOK = ("lost", "changing", "finding", "unread")  # those that need a look
 
 
-def _state(judged: _Judged, last: dict[str, Any] | None, gone: list[dict[str, Any]]) -> tuple[str, float]:
+def _unrevealed(judged: _Judged, last: dict[str, Any]) -> bool:
+    """Return whether the motion shows neither a stiffness nor what could be missing."""
+    unknown = not judged["transmissions"] and last["model"] != RIGID
+    return unknown or bool(last["verdict"] == "insufficient_excitation")
+
+
+def _fewest(judged: _Judged, rows: list[dict[str, Any]]) -> int:
+    """Return the length of the shortest series that a change was looked for in."""
+    done = sum(row["status"] == "done" for row in rows)
+    return min((len(one["series"]) for one in judged["transmissions"]), default=done)
+
+
+def _state(
+    judged: _Judged, rows: list[dict[str, Any]], last: dict[str, Any] | None, gone: list[dict[str, Any]]
+) -> tuple[str, float]:
     """Urgency of a joint, and relative size of the change to sort by."""
     moved = [abs(c["amount_relative"]) for t in judged["transmissions"] for c in t["changes"]]
     moved += [c["share"] for one in judged["parameters"] for c in one["changes"]]
@@ -200,8 +214,7 @@ def _state(judged: _Judged, last: dict[str, Any] | None, gone: list[dict[str, An
         return "unread", 0.0
     if last["verdict"] not in _NO_PLACE:
         return "finding", abs(last["error_before_relative"] - last["error_after_relative"])
-    unknown = not judged["transmissions"] and last["model"] != RIGID
-    if unknown or last["verdict"] == "insufficient_excitation":
+    if _unrevealed(judged, last) or _fewest(judged, rows) < LEAST:
         return "undecided", 0.0
     return "steady", 0.0
 
@@ -209,6 +222,7 @@ def _state(judged: _Judged, last: dict[str, Any] | None, gone: list[dict[str, An
 def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: list[dict[str, Any]]) -> str:
     """Summary of a joint in words."""
     said = []
+    last = next((row for row in reversed(rows) if row["status"] == "done"), None)
     several = any(row["transmission"] == 2 for row in rows)
     for one in (*judged["transmissions"], *judged["parameters"]):
         of = f" of motor {one.get('transmission') or one['motor']}" if several else ""
@@ -225,7 +239,6 @@ def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: lis
         said.insert(
             0, f"The last {which} no stiffness, from {gone[0]['time'][:10]} on: {gone[-1]['reason']}."
         )
-        last = next((row for row in reversed(rows) if row["status"] == "done"), None)
         if state == "lost" and last is not None and last["verdict"] not in _NO_PLACE:
             before = "" if last is rows[-1] else "The last one that could be used says: "
             said.append(f"{before}{last['sentence']}")
@@ -236,11 +249,9 @@ def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: lis
     if state == "finding":
         return _found([row for row in rows if row["status"] == "done"])
     if state == "undecided":
-        return "The motion does not reveal the stiffness or what could be missing: record a richer one."
-    done = sum(row["status"] == "done" for row in rows)
-    fewest = min((len(one["series"]) for one in judged["transmissions"]), default=done)
-    if fewest < LEAST:
-        return f"Too few recordings to judge a change: {fewest}, of {LEAST} or more."
+        if last is not None and _unrevealed(judged, last):
+            return "The motion does not reveal the stiffness or what could be missing: record a richer one."
+        return f"Too few recordings to judge a change: {_fewest(judged, rows)}, of {LEAST} or more."
     if judged["effects"]:
         return f"Steady in the last recording; before it {_earlier(judged['effects'])}."
     return "Steady."

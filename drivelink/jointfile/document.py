@@ -11,6 +11,7 @@ import tomllib
 import typing
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -266,8 +267,14 @@ def _require_whole(text: str, where: str) -> None:
                 f"{where}: truncated: its last line, the check line, is missing (write it again; if you "
                 "removed that line yourself, remove the first one as well)"
             )
-    elif _digest(text[: checks[-1].start()]) != checks[-1][1]:
-        _LOG.warning("%s: edited since drivelink wrote it: read as it is now", where)
+    elif (digest := _digest(text[: checks[-1].start()])) != checks[-1][1]:
+        _warn_once(where, digest)
+
+
+@lru_cache(maxsize=16)
+def _warn_once(where: str, _digest: str) -> None:
+    """A file is read several times: for its joint, its text, what is changed in it."""
+    _LOG.warning("%s: edited since drivelink wrote it: read as it is now", where)
 
 
 def _merge(table: Any, changes: dict[str, Any], *, dotted: bool = False) -> None:

@@ -19,6 +19,7 @@ from estimator.comparison import Correlation, Curve, correlations, friction_curv
 from estimator.errors import EstimatorError
 from estimator.freerun import FreeRun, free_run, simulation_s
 from estimator.model import JointModel
+from estimator.reasons import percent
 from estimator.sample import SIGMA_95, Record
 
 _POINTS = 200
@@ -220,7 +221,7 @@ def fits(runs: Mapping[str, FreeRun], of: str) -> Section:
     if first is None:
         return Section("", [])
     columns = {name: [_fit(run.fit_percent[c]) for c in first.channels] for name, run in runs.items()}
-    if any(percent >= 0.0 for percent in first.coasting_percent.values()):  # the mean is a better rival else
+    if any(fit >= 0.0 for fit in first.coasting_percent.values()):  # the mean is a better rival else
         at_constant = [first.coasting_percent[channel] for channel in first.channels]
         columns["at constant velocity"] = [_fit(fit) if not fit < 0.0 else "below 0 %" for fit in at_constant]
     rows: Rows = list(zip(map(_in_words, first.channels), *columns.values(), strict=True))
@@ -228,10 +229,10 @@ def fits(runs: Mapping[str, FreeRun], of: str) -> Section:
     return Section(f"Free run, from measured states every {first.horizon_s:.3g} s", [Grid(heads, rows)])
 
 
-def _fit(percent: float) -> str:
-    if math.isnan(percent):  # a channel that does not vary
+def _fit(fit_percent: float) -> str:
+    if math.isnan(fit_percent):  # a channel that does not vary
         return "–"
-    return "diverges" if percent < _DIVERGES else f"{percent:.1f} %"
+    return "diverges" if fit_percent < _DIVERGES else percent(0.01 * fit_percent, 1)
 
 
 def fits_json(runs: Mapping[str, FreeRun], of: str) -> dict[str, Any]:

@@ -153,7 +153,7 @@ def sections(outcome: Diagnosis, units: Units) -> list[Section]:
         Section("Error of the motor torque balance", [_errors(outcome, units)]),
         Section("What reveals it", [_curve_chart(curve, units) for curve in outcome.curves], wide),
         Section("Stiffness before and after", [_stiffness_chart(s, units) for s in outcome.stiffness], wide),
-        Section("Parameters", [_parameters(outcome, units)], wide=False),
+        Section("Parameters", _parameters(outcome, units), wide=False),
         Section("Where the candidates stood", _candidates(outcome), wide=False),
         Section("What could not be separated, and what would separate it", _doubts(outcome)),
         Section("Notes", [Lines(outcome.notes)] if outcome.notes else []),
@@ -171,7 +171,7 @@ def _errors(outcome: Diagnosis, units: Units) -> Grid:
     for name, one in (("training", outcome.train), ("validation", outcome.validation)):
         most = max(one.before_rms_nm, one.after_rms_nm)
         before, after = (
-            f"{among(rms, most)} {unit}, {percent(relative, 2)}"
+            f"{among(rms, min(most, 100.0 * rms))} {unit}, {percent(relative, 2)}"  # two digits at least
             for rms, relative in (
                 (one.before_rms_nm, one.before_relative), (one.after_rms_nm, one.after_relative)
             )
@@ -183,7 +183,7 @@ def _errors(outcome: Diagnosis, units: Units) -> Grid:
     return Grid(("", "as declared", after, "after / before"), rows)
 
 
-def _parameters(outcome: Diagnosis, units: Units) -> Grid:
+def _parameters(outcome: Diagnosis, units: Units) -> list[Block]:
     rows: Rows = []
     for finding in outcome.effects:
         rows += [(title_of(finding, outcome),)] if finding.parameters else []
@@ -196,7 +196,7 @@ def _parameters(outcome: Diagnosis, units: Units) -> Grid:
     rows += [("corrected in the readings",)] if outcome.alignment else []
     for name, value in outcome.alignment.items():
         rows += parameter_rows(name, value, outcome.alignment_std.get(name), units)
-    return Grid(PARAMETER_HEAD, rows)
+    return [Grid(PARAMETER_HEAD, rows)] if rows else []
 
 
 def _candidates(outcome: Diagnosis) -> list[Block]:

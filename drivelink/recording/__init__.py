@@ -12,7 +12,7 @@ from drivelink.jointfile import JointFile
 from drivelink.recording.canframes import is_frame_log, read_frame_record
 from drivelink.recording.columns import ColumnMap, column_map, record_from_columns, renamed
 from drivelink.recording.formats import CONVERTERS, FORMATS
-from drivelink.recording.mcapfile import read_mcap
+from drivelink.recording.mcapfile import read_mcap, warn_of_another
 from estimator.sample import Record
 
 __all__ = ["read"]
@@ -59,4 +59,6 @@ def read(
         raise UsageError(f"--map: {path}: only CSV files have columns to be named")
     if is_frame_log(path):
         return read_frame_record(path, joint, Path(base_dir), channel)
+    if joint is not None:
+        warn_of_another(path, joint.name)
     return read_mcap(path, joint, keep_nan)

@@ -125,6 +125,8 @@ def _plotjuggler(joint: str, plots: Sequence[tuple[str, str, list[str]]]) -> str
 class FoxgloveSink(MessageSink):
     """Serves each topic to Foxglove Studio and PlotJuggler, on loopback.
 
+    The newest document of a topic is sent again whenever a client subscribes to it, as zenoh does.
+
     Args:
         port: of the server; 0: any.
 
@@ -144,11 +146,12 @@ class FoxgloveSink(MessageSink):
         context = self._context = foxglove.Context()  # channels close with it
         try:
             self._server: Any = foxglove.start_server(
-                name="drivelink", host="127.0.0.1", port=port, context=context
+                name="drivelink", host="127.0.0.1", port=port, context=context, server_listener=self
             )
         except (OSError, RuntimeError) as error:
             raise UsageError(f"--port {port}: cannot be served: {error}") from error
         self.port: int = self._server.port  # where it listens
+        self._newest: dict[str, tuple[int, bytes]] = {}  # documents by topic: stamp and content
         self._channels = {}
         for topic in TOPICS:
             name = SCHEMA_NAMES.get(topic, f"drivelink.{topic}")
@@ -158,6 +161,20 @@ class FoxgloveSink(MessageSink):
             self._channels[topic] = foxglove.Channel(
                 f"/{joint.name}/{topic}", schema=schema, message_encoding="json", context=context
             )
+
+    def on_subscribe(self, _client: object, channel: Any) -> None:
+        """Send what a client has missed; foxglove-sdk calls this in a thread of its own."""
+        topic = channel.topic.rpartition("/")[2]
+        if newest := self._newest.get(topic):
+            self._put(topic, *newest)
+
+    def on_unsubscribe(self, _client: object, channel: Any) -> None:
+        """Do nothing; foxglove-sdk asks for it."""
+
+    def document(self, name: str, payload: bytes, stamp_ns: int) -> None:
+        """Send a document, and keep it for clients to come."""
+        self._newest[name] = stamp_ns, payload
+        super().document(name, payload, stamp_ns)
 
     def flush(self) -> None:
         """Do nothing: every message is sent at once."""

@@ -190,7 +190,7 @@ def _signals(tpdo: TpdoLayout, layout: NodeLayout) -> list[Any]:
     signals: list[Any] = []
     start = 0
     for mapped in tpdo.objects:
-        conversion = BaseConversion.factory(scale=mapped.scale, offset=-mapped.offset)
+        conversion = BaseConversion.factory(scale=mapped.scale, offset=0.0 - mapped.offset)
         signals.append(
             DbcSignal(
                 _name(mapped, layout),

@@ -152,6 +152,19 @@ def _warn_once(path: Path, _mtime_ns: int) -> None:
     _LOG.warning("%s: truncated or damaged: read up to the damage", path)
 
 
+def warn_of_another(path: Path, joint: str) -> None:
+    """Warn if a recording is of a joint with another name than that of the joint file."""
+    if message := next(read_messages(path, frozenset({"sample"})), None):
+        recorded = message.topic.strip("/").rpartition("/")[0]
+        if recorded != joint:
+            _warn_of_another_once(path, recorded, joint)
+
+
+@lru_cache(maxsize=16)
+def _warn_of_another_once(path: Path, recorded: str, joint: str) -> None:
+    _LOG.warning('%s: recorded of "%s", while the joint file is of "%s"', path, recorded[:80], joint)
+
+
 class _BrokenError(Exception):
     """The rest cannot be read."""
 

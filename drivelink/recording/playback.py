@@ -23,7 +23,7 @@ from drivelink.recording.canframes import FrameLog, is_frame_log
 from drivelink.recording.columns import ColumnMap
 from drivelink.recording.cycles import Cycle, estimated
 from drivelink.recording.mapping import joint_of
-from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, recorded_cycles
+from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, recorded_cycles, warn_of_another
 from drivelink.recording.messages import (
     estimate_columns,
     estimate_row,
@@ -100,6 +100,7 @@ def open_playback(
         log = FrameLog(path, joint, base_dir, channel)
         return Playback(joint, log.period_s, None, lambda _: log.cycles())
     if path.suffix.lower() == ".mcap":
+        warn_of_another(path, joint.name)
         recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)
         state = _state(path, joint)
         after = lambda pipeline: _after(state, recorded, pipeline, path)  # noqa: E731

@@ -139,7 +139,11 @@ class SafeFile(io.BufferedIOBase):
             raise self._failed(error) from error
 
     def _failed(self, error: OSError) -> RecordingError:
-        kept = "it holds everything up to the last second" if self._file.placed else "nothing was written"
+        kept = (
+            "it holds everything up to the last second"
+            if self._size and self._file.placed
+            else "nothing was written"
+        )
         return RecordingError(f"{self._path}: cannot be written any further: {error.strerror}; {kept}")
 
 

@@ -1,7 +1,7 @@
 //! Print a joint's estimates, those missing counted: `cargo run -- elbow [tcp/127.0.0.1:7447 [COUNT]]`.
 
 use std::io::{self, Write};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use drivelink_wire::Estimate;
 use zenoh::handlers::RingChannel;
@@ -26,7 +26,12 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     let mut last: Option<u64> = None;
     let mut missing = 0;
     for _ in 0..count {
-        let sample = subscriber.recv()?;
+        let sample = loop {
+            match subscriber.recv_timeout(Duration::from_secs(3))? {
+                Some(sample) => break sample,
+                None => eprintln!("no estimate of {joint} at {endpoint}: `drivelink list` names the joints"),
+            }
+        };
         let estimate = match Estimate::decode(sample.payload()) {
             Ok(estimate) => estimate,
             Err(error) => {

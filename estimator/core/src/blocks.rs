@@ -308,7 +308,8 @@ impl Blocks {
         self.own = self.noise.variance.sqrt();
         self.residual = frame.residual(&prior.mean, known);
         self.torque = self.spring.torque_rms(&projection, block, self.lost);
-        self.posterior = Some(Posterior { set: known, x: prior.mean, covariance, log_evidence: 0.0 });
+        self.posterior =
+            Some(Posterior { set: known, x: prior.mean, covariance, log_evidence: 0.0, square: 0.0 });
         (self.frame, self.fitted) = (Some(frame), true);
     }
 

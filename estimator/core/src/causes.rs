@@ -10,9 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::balance::{ACCELERATION, DRY, LATE, OFFSET, READ, SPRING, TORQUE, TORQUE_RATE, VELOCITY};
 use crate::choices::EVEN;
-use crate::gram::{
-    COLUMNS, Frame, Gram, Matrix, Prior, Reduced, Row, Set, UNKNOWNS, dot, log_determinant, solve, unknowns,
-};
+use crate::gram::{COLUMNS, Frame, Gram, Matrix, Prior, Reduced, Row, Set, UNKNOWNS, dot, solve, unknowns};
 use crate::spring::{Coefficients, TERMS};
 use crate::unknowns;
 
@@ -263,10 +261,7 @@ impl Known<'_> {
         let mut odds = Odds { of: [Explanation::default(); CAUSES], log: [f64::NEG_INFINITY; CAUSES] };
         let mut judged = |cause: Cause, reduced: &Reduced, set: Set, prior: &Prior, unit: f64| {
             let Some(found) = solve(reduced, set, prior, scale) else { return f64::INFINITY };
-            let log_ratio = log_determinant(&prior.precision, set)
-                - log_determinant(&information(reduced, &prior.precision, scale), set);
-            // 2 ln evidence = log_ratio − square left.
-            let square = log_ratio - 2.0 * found.log_evidence;
+            let (square, log_ratio) = (found.square, 2.0 * found.log_evidence + found.square);
             let (x, std) = own.map_or((0.0, 0.0), |own| (found.x[own], found.covariance[own][own].sqrt()));
             odds.log[cause as usize] = evidence(square, log_ratio);
             odds.of[cause as usize] = Explanation {
@@ -316,14 +311,6 @@ fn with_direction(reduced: &Reduced, window: &Gram, frame: &Frame, v: &Row, own:
 fn put(v: &mut Row, column: usize, value: f64) -> f64 {
     v[column] = value;
     value
-}
-
-fn information(reduced: &Reduced, precision: &Matrix, scale: f64) -> Matrix {
-    let mut out = *precision;
-    for (i, row) in out.iter_mut().enumerate() {
-        row.iter_mut().zip(&reduced[i]).for_each(|(value, sum)| *value += sum / scale);
-    }
-    out
 }
 
 impl Odds {

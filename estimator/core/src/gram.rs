@@ -34,7 +34,7 @@ pub type Set = u32;
 
 const PIVOT: f64 = 1e-13; // of a scaled diagonal of 1: rounding of sums of products
 
-/// COLUMNS, as a number that the compiler does not see: unrolled, 38 columns are 741 statements a loop.
+/// COLUMNS, as a number that the compiler does not see: unrolled, 38 columns are 1444 statements a loop.
 fn all() -> usize {
     std::hint::black_box(COLUMNS)
 }
@@ -48,7 +48,7 @@ pub fn set(unknowns: Range<usize>) -> Set {
 /// z · c.
 #[must_use]
 pub fn dot(z: &Row, c: &Row) -> f64 {
-    z.iter().zip(c).map(|(z, c)| z * c).sum()
+    product(z, c)
 }
 
 /// Σ a b, in four sums side by side.
@@ -60,7 +60,7 @@ fn product(a: &[f64], b: &[f64]) -> f64 {
     sums.iter().sum::<f64>() + rest
 }
 
-/// Σ z zᵀ of rows: the lower triangle, and how many rows.
+/// Σ z zᵀ of rows, and how many rows.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Gram {
     #[serde(with = "crate::snapshot::rows")]
@@ -79,7 +79,7 @@ impl Gram {
     /// Add one row.
     pub fn add_row(&mut self, row: &Row) {
         for i in 0..all() {
-            for (sum, z) in self.sums[i][..=i].iter_mut().zip(row) {
+            for (sum, z) in self.sums[i].iter_mut().zip(row) {
                 *sum += row[i] * z;
             }
         }
@@ -89,7 +89,7 @@ impl Gram {
     /// Add the rows of another one; with a weight of −1 they are left out again.
     pub fn add(&mut self, other: &Gram, weight: f64) {
         for i in 0..all() {
-            for (sum, z) in self.sums[i][..=i].iter_mut().zip(&other.sums[i]) {
+            for (sum, z) in self.sums[i].iter_mut().zip(&other.sums[i]) {
                 *sum += weight * z;
             }
         }
@@ -99,7 +99,7 @@ impl Gram {
     /// The same rows with each column times a factor.
     pub fn scale(&mut self, factors: &Row) {
         for i in 0..all() {
-            for (sum, factor) in self.sums[i][..=i].iter_mut().zip(factors) {
+            for (sum, factor) in self.sums[i].iter_mut().zip(factors) {
                 *sum *= factors[i] * factor;
             }
         }
@@ -110,8 +110,8 @@ impl Gram {
     pub fn noise(&self, of: Range<usize>, slopes: usize, variance: f64) -> Gram {
         let mut out = Gram { rows: self.rows, ..Gram::default() };
         let first = of.start;
-        for i in of {
-            for j in first..=i {
+        for i in of.clone() {
+            for j in of.clone() {
                 out.sums[i][j] = variance * self.at(slopes + i - first, slopes + j - first);
             }
         }
@@ -121,7 +121,7 @@ impl Gram {
     /// One entry.
     #[must_use]
     pub fn at(&self, i: usize, j: usize) -> f64 {
-        self.sums[i.max(j)][i.min(j)]
+        self.sums[i][j]
     }
 
     /// Root mean square of one column.
@@ -134,10 +134,8 @@ impl Gram {
     #[must_use]
     pub fn times(&self, c: &Row) -> Row {
         let mut out = [0.0; COLUMNS];
-        for i in 0..all() {
-            let (left, diagonal) = (&self.sums[i][..i], self.sums[i][i]);
-            out.iter_mut().zip(left).for_each(|(out, sum)| *out += sum * c[i]);
-            out[i] += product(left, &c[..i]) + diagonal * c[i];
+        for i in (0..all()).filter(|i| c[*i] != 0.0) {
+            out.iter_mut().zip(&self.sums[i]).for_each(|(out, sum)| *out += sum * c[i]);
         }
         out
     }
@@ -184,6 +182,8 @@ pub struct Posterior {
     pub covariance: Matrix,
     /// ln of the marginal likelihood, but for what all sets have in common.
     pub log_evidence: f64,
+    /// The square of what is left over the noise.
+    pub square: f64,
 }
 
 impl Posterior {
@@ -198,57 +198,94 @@ impl Posterior {
     }
 }
 
-/// ln of the determinant of a set's part of a positive definite matrix.
-#[must_use]
-pub fn log_determinant(matrix: &Matrix, set: Set) -> f64 {
-    Cholesky::new(set, |i, j| matrix[i][j]).log_determinant
-}
-
 /// The inverse of a set's part of a positive definite matrix.
 #[must_use]
 pub fn inverse(matrix: &Matrix, set: Set) -> Matrix {
-    Cholesky::new(set, |i, j| matrix[i][j]).inverse()
+    Cholesky::new(set, matrix).inverse()
 }
 
-/// Information, its vector and the square of what there is to explain, of a set's unknowns.
-fn system(reduced: &Reduced, set: Set, prior: &Prior, noise: f64) -> (Cholesky, Vector, f64) {
-    let cholesky = Cholesky::new(set, |i, j| reduced[i][j] / noise + prior.precision[i][j]);
-    let (mut vector, mut square) = ([0.0; UNKNOWNS], reduced[0][0] / noise);
-    for i in unknowns(set) {
-        let pull: f64 = unknowns(set).map(|j| prior.precision[i][j] * prior.mean[j]).sum();
-        vector[i] = reduced[i][0] / noise + pull;
-        square += prior.mean[i] * pull;
+/// Information of a set's unknowns before and after the rows.
+struct System<'a> {
+    reduced: &'a Reduced,
+    prior: &'a Prior,
+    noise: f64,
+    information: Matrix,
+    set: Set,
+    before: Cholesky,
+    after: Cholesky,
+}
+
+impl System<'_> {
+    fn new<'a>(reduced: &'a Reduced, set: Set, prior: &'a Prior, noise: f64) -> System<'a> {
+        let mut information = prior.precision;
+        for (i, row) in information.iter_mut().enumerate() {
+            row.iter_mut().zip(&reduced[i]).for_each(|(value, sum)| *value += sum / noise);
+        }
+        let before = Cholesky::new(set, &prior.precision);
+        let after = Cholesky::new(set, &information);
+        System { reduced, prior, noise, information, set, before, after }
     }
-    (cholesky, vector, square)
+
+    fn add(&mut self, more: Set) {
+        self.before.add(more, &self.prior.precision);
+        self.after.add(more, &self.information);
+        self.set |= more;
+    }
+
+    fn take_away(&mut self, less: Set) {
+        self.before.take_away(less.count_ones() as usize);
+        self.after.take_away(less.count_ones() as usize);
+        self.set &= !less;
+    }
+
+    /// ln of the marginal likelihood, and the square of what is left over the noise.
+    ///
+    /// A set with a weaker spring leaves less of the noise that is in the deflection: that speaks for none.
+    fn evidence(&self) -> (f64, f64) {
+        let (vector, explained) = self.vector();
+        let white = self.after.whiten(&vector);
+        let left = self.reduced.left_noise(&self.after.unwhiten(&white), self.set);
+        let square = explained - product(&white, &white) - left / self.noise;
+        (0.5 * (self.before.log_determinant() - self.after.log_determinant() - square), square)
+    }
+
+    /// What the rows and the prior say together, and the square of it.
+    fn vector(&self) -> (Vector, f64) {
+        let (mut vector, mut square) = ([0.0; UNKNOWNS], self.reduced[0][0] / self.noise);
+        for i in unknowns(self.set) {
+            vector[i] += self.reduced[i][0] / self.noise;
+            let mean = self.prior.mean[i];
+            if mean == 0.0 {
+                continue;
+            }
+            for j in unknowns(self.set) {
+                let pull = self.prior.precision[i][j] * mean;
+                vector[j] += pull;
+                square += self.prior.mean[j] * pull;
+            }
+        }
+        (vector, square)
+    }
 }
 
 /// ln of the marginal likelihood of a set's unknowns, but for what all sets have in common.
 ///
-/// A set with a weaker spring leaves less of the noise that is in the deflection: that speaks for none.
-///
 /// `noise`: variance of a row times the rows that an independent one is worth.
 #[must_use]
 pub fn log_evidence(reduced: &Reduced, set: Set, prior: &Prior, noise: f64) -> f64 {
-    let (cholesky, vector, square) = system(reduced, set, prior, noise);
-    let white = cholesky.whiten(&vector);
-    let gain: f64 = white.iter().map(|u| u * u).sum();
-    let before = Cholesky::new(set, |i, j| prior.precision[i][j]).log_determinant;
-    let left = reduced.left_noise(&cholesky.unwhiten(&white), set);
-    0.5 * (before - cholesky.log_determinant - square + gain + left / noise)
+    System::new(reduced, set, prior, noise).evidence().0
 }
 
 /// Posterior of a set's unknowns; `None`: a number is not finite. `noise`: see [`log_evidence`].
 #[must_use]
 pub fn solve(reduced: &Reduced, set: Set, prior: &Prior, noise: f64) -> Option<Posterior> {
-    let (cholesky, vector, _) = system(reduced, set, prior, noise);
-    let covariance = cholesky.inverse();
+    let system = System::new(reduced, set, prior, noise);
+    let (covariance, (vector, _)) = (system.after.inverse(), system.vector());
     let mut x = [0.0; UNKNOWNS];
-    for i in unknowns(set) {
-        x[i] = covariance[i].iter().zip(&vector).map(|(c, b)| c * b).sum();
-    }
-    let log_evidence = log_evidence(reduced, set, prior, noise);
+    unknowns(set).for_each(|i| x[i] = product(&covariance[i], &vector));
+    let (log_evidence, square) = system.evidence();
     let finite = log_evidence.is_finite() && x.iter().all(|x| x.is_finite());
-    finite.then_some(Posterior { set, x, covariance, log_evidence })
+    finite.then_some(Posterior { set, x, covariance, log_evidence, square })
 }
 
 /// The groups of unknowns that the evidence adds to a base, one after the other.
@@ -258,21 +295,29 @@ pub fn solve(reduced: &Reduced, set: Set, prior: &Prior, noise: f64) -> Option<P
 #[must_use]
 pub fn choose(reduced: &Reduced, base: Set, groups: &[Set], usual: Set, prior: &Prior, noise: f64) -> Set {
     let threshold = (groups.iter().filter(|group| **group != 0).count().max(1) as f64).ln();
-    let (mut set, mut best) = (base, log_evidence(reduced, base, prior, noise));
+    let mut system = System::new(reduced, base, prior, noise);
+    let mut best = system.evidence().0;
     loop {
-        let mut next = (set, best, 0.0);
-        for group in groups.iter().filter(|group| *group & !set != 0) {
-            let tried = log_evidence(reduced, set | group, prior, noise);
+        let mut next = (0, best, 0.0);
+        for group in groups {
+            let more = group & !system.set;
+            if more == 0 {
+                continue;
+            }
+            system.add(more);
+            let tried = system.evidence().0;
+            system.take_away(more);
             let odds = tried - best - threshold;
-            let odds = if odds > 0.0 && group & !set & !usual == 0 { odds + threshold } else { odds };
+            let odds = if odds > 0.0 && more & !usual == 0 { odds + threshold } else { odds };
             if odds > next.2 {
-                next = (set | group, tried, odds);
+                next = (more, tried, odds);
             }
         }
-        if next.0 == set {
-            return set;
+        if next.0 == 0 {
+            return system.set;
         }
-        (set, best) = (next.0, next.1);
+        system.add(next.0);
+        best = next.1;
     }
 }
 

@@ -7,6 +7,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::choices::{MARGIN, REACHED};
+use crate::gram::{UNKNOWNS, inverse, set};
 use crate::laws::Law;
 
 /// Functions of a family.
@@ -134,19 +135,17 @@ impl Projection {
         }
         let rows = nodes.map(|phi| family.at(phi / size, size));
         const N: usize = 2 * TERMS;
-        let mut normal = [[0.0; N]; N];
+        let mut normal = [[0.0; UNKNOWNS]; UNKNOWNS];
         for row in &rows {
             for i in 0..N {
-                (0..N).for_each(|j| normal[i][j] += row[i] * row[j]);
+                (0..N).for_each(|j| normal[1 + i][1 + j] += row[i] * row[j]);
             }
         }
-        (0..N).for_each(|i| normal[i][i] *= 1.0 + RIDGE);
-        let scale: [f64; N] = std::array::from_fn(|i| normal[i][i].max(f64::MIN_POSITIVE).sqrt().recip());
-        let mut weights = [[0.0; NODES]; N];
-        for (k, row) in rows.iter().enumerate() {
-            let solved = solve(&normal, row, &scale);
-            (0..N).for_each(|i| weights[i][k] = solved[i]);
-        }
+        (1..=N).for_each(|i| normal[i][i] *= 1.0 + RIDGE);
+        let inverse = inverse(&normal, set(1..N + 1));
+        let weights = std::array::from_fn(|i| {
+            rows.map(|row| row.iter().zip(&inverse[1 + i][1..]).map(|(b, c)| b * c).sum())
+        });
         Projection { nodes, weights }
     }
 
@@ -167,28 +166,6 @@ impl Projection {
     pub fn of(&self, function: impl Fn(f64) -> f64) -> Coefficients {
         self.fit(&self.nodes.map(function))
     }
-}
-
-/// Solve a small positive definite system by Cholesky's factorisation, scaled by its diagonal.
-fn solve<const N: usize>(matrix: &[[f64; N]; N], b: &[f64; N], scale: &[f64; N]) -> [f64; N] {
-    let mut factor = [[0.0; N]; N];
-    for i in 0..N {
-        for j in 0..=i {
-            let rest: f64 = (0..j).map(|k| factor[i][k] * factor[j][k]).sum();
-            let value = matrix[i][j] * scale[i] * scale[j] - rest;
-            factor[i][j] = if i == j { value.max(RIDGE).sqrt() } else { value / factor[j][j] };
-        }
-    }
-    let mut x = [0.0; N];
-    for i in 0..N {
-        let rest: f64 = (0..i).map(|k| factor[i][k] * x[k]).sum();
-        x[i] = (b[i] * scale[i] - rest) / factor[i][i];
-    }
-    for i in (0..N).rev() {
-        let rest: f64 = (i + 1..N).map(|k| factor[k][i] * x[k]).sum();
-        x[i] = (x[i] - rest) / factor[i][i];
-    }
-    std::array::from_fn(|i| x[i] * scale[i])
 }
 
 #[cfg(test)]

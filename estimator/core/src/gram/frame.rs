@@ -4,7 +4,7 @@ use std::ops::{Index, IndexMut};
 
 use serde::{Deserialize, Serialize};
 
-use super::{COLUMNS, Gram, Matrix, PIVOT, Posterior, Row, Set, UNKNOWNS, Vector, dot, unknowns};
+use super::{COLUMNS, Gram, Matrix, PIVOT, Posterior, Row, Set, UNKNOWNS, Vector, dot, product, unknowns};
 
 /// What each unknown adds to a row's balance, and what they explain together.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -85,9 +85,10 @@ pub struct Reduced {
 impl Reduced {
     /// What noise of the columns these unknowns leave in the rows.
     pub(super) fn left_noise(&self, x: &Vector, set: Set) -> f64 {
-        let of = |i: usize| if i == 0 { -1.0 } else { x[i] };
-        let with_left = || std::iter::once(0).chain(unknowns(set));
-        with_left().map(|i| with_left().map(|j| of(i) * of(j) * self.noise[i][j]).sum::<f64>()).sum()
+        let mut with_left = *x;
+        with_left[0] = -1.0;
+        let of = |i: usize| with_left[i] * product(&self.noise[i], &with_left);
+        of(0) + unknowns(set).map(of).sum::<f64>()
     }
 }
 

@@ -121,7 +121,10 @@ def test_the_page_links_events_to_recording_and_diagnosis(tmp_path):
         begin = BEGIN_S + 50.5
         rows = json.loads(get(f"day.json?begin={begin}&end={begin + 10}"))["rows"]
         assert [row[0] - BEGIN_S for row in rows] == list(range(51, 61))
-        for path in ("kept/secret.toml", "kept/..%2Fsecret.toml", "kept/", "day/x"):
+        (tmp_path / event["finding"]).unlink()
+        (tmp_path / event["finding"]).symlink_to("secret.toml")  # somebody has put it there
+        finding = f"kept/{event['finding']}"
+        for path in (finding, "kept/secret.toml", "kept/..%2Fsecret.toml", "kept/", "day/x"):
             with pytest.raises(urllib.error.HTTPError, match="404"):
                 get(path)
         with pytest.raises(urllib.error.HTTPError):

@@ -151,6 +151,22 @@ def test_a_reboot_after_another_loses_one_motors_zero_and_nothing_that_was_found
     assert said == {"motor 2"}
 
 
+def test_what_few_blocks_between_two_reboots_say_of_a_constant_torque_is_not_carried_over():
+    """The zero was not where they took it to be, so the torque at it is none."""
+    motion, offs = kit.motion("quadratic", 10.0), {100: -0.06, 1100: 0.02}
+    estimator = kit.make_estimator(kit.declared("quadratic"), kit.EstimatorSettings(), kit.PERIOD_S)
+    rms, off, valid = np.sqrt(np.mean(motion.torque_nm**2)), 0.0, 0
+    for k, sample in enumerate(motion.samples):
+        if k in offs:
+            off = offs[k]
+            estimator.lose_zeros()
+        own, *others = sample.motor_position_rad
+        one = estimator.step(sample._replace(motor_position_rad=(own + off, *others)))
+        valid += one.status & 1
+        assert not one.status & 1 or abs(one.flexibility_torque_nm - motion.torque_nm[k]) < 0.25 * rms
+    assert valid > 1000
+
+
 @mostly_slow(("name", "after"), ("constant", 840), ("quadratic", 880), ("constant", 920))
 def test_a_doubted_sample_in_the_middle_of_that_judgement_does_not_end_it(name, after):
     """The half block before a sample whose moment is in doubt is not judged as a whole one."""

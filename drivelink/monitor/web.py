@@ -322,7 +322,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         with (
             suppress(OSError),
-            content.open("rb") as file,
+            open(content, "rb", opener=findings.open_own) as file,
         ):  # dropped, or the browser has closed the connection
             self._head(kind, os.fstat(file.fileno()).st_size)
             shutil.copyfileobj(file, self.wfile)

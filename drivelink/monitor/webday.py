@@ -61,7 +61,7 @@ class WebDay:
             return None
         for recording in recordings:
             for one in (recording, page_file(recording), finding_file(recording)):
-                if one.name == name and one.is_file():
+                if one.name == name and one.is_file() and not one.is_symlink():
                     kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
                     return kind + ("; charset=utf-8" if kind.startswith("text/") else ""), one
         return None

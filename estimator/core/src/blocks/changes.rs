@@ -180,8 +180,8 @@ impl Blocks {
     /// Where the zero between the encoders is, is not known any more.
     pub fn lose_zero(&mut self) {
         let found = self.located && !self.doubting && !self.is_unconfirmed() && self.is_explained();
-        if self.are_few() && self.carried.is_none() && !self.is_explained() {
-            self.spring.reset(); // a few blocks that nothing explains have taught nothing
+        if self.are_few() && self.carried.is_none() {
+            self.spring.reset(); // a few blocks have taught nothing: their zero may have been another one, too
         } else if let Some(carried) = self.carried.as_ref().filter(|_| self.lost && !found) {
             // What was learned without a zero may be of another one: as it was before.
             self.spring.alpha[..TERMS].copy_from_slice(&carried.x[SPRING]);

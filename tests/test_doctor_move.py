@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -14,6 +15,7 @@ from daemonkit import served
 
 from drivelink.canopen.layout import Signal
 from drivelink.cli import main
+from drivelink.cli.doctor import _Terminal
 from drivelink.doctor.livevalues import Series, values_of
 from drivelink.doctor.manualcheck import ByHand, Value, check_by_hand
 from drivelink.jointfile import JointFile, load, parse
@@ -263,3 +265,15 @@ def test_a_linear_axis_is_moved_in_millimetres_and_pushed_in_newtons():
     rig.ask = once(rig.ask, "Move", "51")  # type: ignore[method-assign]
     assert check_by_hand(joint(axis="linear"), rig.read, rig).good
     assert "expected an amount like 50 or 0.2 m, got 90 deg" in rig.said
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_line_is_folded_between_words_on_a_terminal_and_whole_elsewhere(terminal, monkeypatch):
+    for name, value in {"COLUMNS": "40", "TERM": "xterm"}.items():
+        monkeypatch.setenv(name, value)
+    out = io.StringIO()
+    monkeypatch.setattr(out, "isatty", lambda: terminal)
+    text = "Turn the joint by 90° in the [positive] direction and hold it there."
+    _Terminal(out).show(text)
+    lines = out.getvalue().rstrip("\n").split("\n")
+    assert " ".join(map(str.rstrip, lines)) == text and (max(map(len, lines)) <= 40) == terminal

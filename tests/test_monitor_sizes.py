@@ -32,6 +32,14 @@ def test_what_to_look_at_is_not_cut_at_the_first_line():
     assert all(len(line) <= 76 for line in shown)
 
 
+def test_where_lines_are_left_out_the_last_one_says_so():
+    document = STATUS | {"conditions": ["drivelink-vsa-ii: the bus is lost: " + "and so on " * 9]}
+    whole, cut = (status_lines(document, 76, most=most) for most in (None, 3))
+    assert len(cut) == 3 < len(whole) and not whole[2].plain.endswith("…")
+    assert cut[-1].plain.endswith(" …") and all(len(line.plain) <= 76 for line in cut)
+    assert not status_lines(document, 76, most=0)
+
+
 def test_the_load_of_a_lost_bus_is_not_shown():
     assert shape(STATUS).load == "38 %" and shape(STATUS | {"state": "bus lost"}).load == ""
 

@@ -107,11 +107,11 @@ class _Terminal:
     """The person at the terminal."""
 
     def __init__(self, out: TextIO) -> None:
-        self._out = out
+        self._out = Console(file=out, highlight=False, markup=False)
 
     def show(self, text: str) -> None:
-        """Print a line."""
-        print(text, file=self._out, flush=True)
+        """Print a line; on a terminal it is folded between words."""
+        self._out.print(text, soft_wrap=not self._out.is_terminal)
 
     def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
         """Print a question, and read a line without waiting for it.
@@ -119,7 +119,7 @@ class _Terminal:
         Raises:
             UsageError: there is nobody to answer.
         """
-        print(f"> {text}", file=self._out, flush=True)
+        self.show(f"> {text}")
         while not select.select([sys.stdin], [], [], 0)[0]:
             meanwhile()
         line = sys.stdin.readline()

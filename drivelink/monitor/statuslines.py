@@ -288,8 +288,13 @@ def status_lines(
     width: int,
     model: Mapping[str, Any] | None = None,
     finding: Mapping[str, Any] | None = None,
+    most: int | None = None,
 ) -> list[Text]:
-    """Return cycle, nodes and residual; why not valid, advice, problems and the finding in two lines each."""
+    """Return cycle, nodes and residual; why not valid, advice, problems and the finding in two lines each.
+
+    Args:
+        most: number of lines that there is room for; where more are left out, the last one ends with "…".
+    """
     if not status:
         return []
     shown = shape(status, model)
@@ -314,7 +319,10 @@ def status_lines(
             for line in whole.split("\n"):
                 line.truncate(width, overflow="ellipsis")
                 lines.append(line)
-    return lines
+    if most and lines[most:]:
+        lines[most - 1].truncate(width - 2)
+        lines[most - 1].append(" …")
+    return lines[:most]
 
 
 def _nodes(shown: Shown) -> list[tuple[str, str]]:

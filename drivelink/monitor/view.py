@@ -190,7 +190,7 @@ class JointView:
             title.append(f" · {self.state}", style="" if self.live else "bold red")
         numbers = self._numbers(width - 4)
         room = height - 2 - numbers.row_count - 1
-        below = status_lines(self.status, width - 4, self.model, self.finding)[: max(0, room - 1)]
+        below = status_lines(self.status, width - 4, self.model, self.finding, max(0, room - 1))
         below = below if self.live else []
         if self.history.latest is not None:
             below.append(Text.assemble(*((f"● {label}  ", ink) for label, ink in self.flags), no_wrap=True))

@@ -120,6 +120,21 @@ def test_the_state_of_another_model_or_of_other_settings_is_not_used(tmp_path, c
         assert ("another model or other settings" in caplog.text) == bool(changes)
 
 
+def test_a_joint_file_that_changes_after_an_event_is_not_that_of_its_recording(tmp_path):
+    scene = Scene(tmp_path)
+    scene.box.document("model", b'{"joint": "elbow", "n": 1}', 1)
+    before = scene.path.read_text()
+    scene.run(20)
+    scene.box.keep("asked")
+    scene.run(20)
+    scene.path.write_text(before + "# another\n")
+    scene.box.document("model", b'{"joint": "elbow", "n": 2}', 2)
+    scene.run(200)
+    ((path, _),) = scene.finish()
+    assert joint_of(path, None).text == before
+    assert json.loads(next(read_messages(path, frozenset({"model"}))).data)["n"] == 1
+
+
 def test_a_state_that_is_read_before_the_first_model_is_of_it_and_not_of_the_next_one(tmp_path):
     scene = Scene(tmp_path)
     scene.box.snapshot(b"first")

@@ -103,11 +103,13 @@ _MASK = sum(int(bit) for bit in _FLAGS)
 
 
 class _Event(NamedTuple):
-    """What is to be kept: its causes, when the first came (clock of the box and wall time)."""
+    """What is to be kept: its causes; when the first came, and the joint file and model of that time."""
 
     causes: list[str]
-    at_s: float
+    at_s: float  # by the clock of the box
     wall: datetime
+    text: JointText
+    model: tuple[str, bytes, int] | None
 
     @property
     def cause(self) -> str:
@@ -235,7 +237,7 @@ class BlackBox(Sink):
         if not asked and now_s - self._last_s.get(cause, -_QUIET_S) < _QUIET_S:
             return
         self._last_s[cause] = now_s
-        self._event = _Event([cause], now_s, datetime.now(UTC))
+        self._event = _Event([cause], now_s, datetime.now(UTC), self._text, self._model)
 
     def flush(self) -> None:
         """Begin to write what is complete, take a wish, add a row to the day; called once a second."""
@@ -279,21 +281,21 @@ class BlackBox(Sink):
     def _write(self, event: _Event, state: bytes | None, items: Iterable[Item]) -> None:
         """Write one recording; what goes wrong is one line, and no half of a file stays."""
         sink: McapSink | None = None
-        name, wall = self._text.joint.name, event.wall
+        text, name, wall = event.text, event.text.joint.name, event.wall
         while (path := self._folder / recording_name(name, event.cause, wall)).exists():
             wall += timedelta(seconds=1)  # of a clock that was set back, or begins with each start
         unfinished, lock = path.with_suffix(UNFINISHED), None
         try:
-            sink = McapSink(unfinished, self._text.joint, self._text.text, force=True)
+            sink = McapSink(unfinished, text.joint, text.text, force=True)
             sink.flush()  # it has its name: what a kill leaves is found at the next start
             lock = _locked(unfinished)  # which may be that of another daemon, while this one ends
             time_text = event.wall.isoformat(timespec="milliseconds")
             about = {"cause": event.cause, "causes": ", ".join(event.causes), "time": time_text}
-            sink.note("black box", {**about, "joint_file": self._text.name})
+            sink.note("black box", {**about, "joint_file": text.name})
             if self._mapping is not None:
                 sink.mapping(*self._mapping)
-            if self._model is not None:
-                sink.document(*self._model)
+            if event.model is not None:
+                sink.document(*event.model)
             if state is not None:
                 sink.snapshot(state)
             for number, (_, kind, values) in enumerate(items, start=1):
@@ -302,11 +304,11 @@ class BlackBox(Sink):
                     sink.flush()
             sink.close()
             unfinished.replace(path)
-            drop_oldest(self._folder, self._text.joint.name, self._section.keep_mib)
+            drop_oldest(self._folder, name, self._section.keep_mib)
         except (OSError, RecordingError) as error:
             cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
             why = f"{path}: nothing is kept: {getattr(cause, 'strerror', None) or cause}"
-            _LOG.error("%s: %s: %s", self._text.joint.name, event.cause, why)
+            _LOG.error("%s: %s: %s", name, event.cause, why)
             if sink is not None:
                 sink.abandon()
                 unfinished.unlink(missing_ok=True)
@@ -315,7 +317,7 @@ class BlackBox(Sink):
         finally:
             if lock is not None:
                 os.close(lock)
-        _LOG.warning("%s: %s: kept in %s", self._text.joint.name, event.cause, path)
+        _LOG.warning("%s: %s: kept in %s", name, event.cause, path)
         self._answer(event, path.name)
 
     def _answer(self, event: _Event, text: str) -> None:

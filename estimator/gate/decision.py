@@ -255,9 +255,10 @@ def _decided(
         if found and not blamed and odds >= _decisive():
             return Judgement(reason=_another_inertia(joint, weighed), left=after)
         if before > choice("unexplained"):
-            return Judgement(
-                reason=f"the motion explains {percent(1.0 - before, 0)} of the torque", left=before
-            )
+            doubt = f"the motion explains {percent(1.0 - before, 0)} of the torque"
+            if before > 1.0:
+                doubt = f"what is declared leaves {percent(before, 0)} of the torque: is it a recording of this joint?"
+            return Judgement(reason=doubt, left=before)
         return Judgement(undecided=_undecided(joint, single, declared), left=before)
     even = -log_odds(choice("even"))
     alike = [

@@ -316,7 +316,7 @@ def status(residual: float, *, observable: bool = True, alarm: bool = False) -> 
             [0.11, 0.12, 0.13, 0.1, 0.14],
             True,
             True,
-            "has fallen, within its limit for 5 s of motion: now 1.4 × its baseline",
+            "has fallen: for 5 s of motion the new model's own test has allowed it, 1.4 × its baseline in the last one",
         ),
         ([0.11, 0.12, 0.9, 0.1, 0.14, 0.12], True, False, "has not fallen within a minute"),
         ([0.11, 0.12, 0.13, 0.1, 0.14], False, False, "has not moved enough"),

@@ -220,7 +220,10 @@ class Trial:
         """Return what has come of it so far."""
         level = f"{max(self.ratios):.2g} × its baseline" if self.ratios else "not measured yet"
         if self.fallen:
-            return f"the residual has fallen, within its limit for {_QUIET_SECONDS} s of motion: now {level}"
+            return (
+                f"the residual has fallen: for {_QUIET_SECONDS} s of motion the new model's own test has "
+                f"allowed it, {level} in the last one"
+            )
         if not self.in_use:
             if self.fallen is None:
                 return "waiting for the daemon to take the joint file"

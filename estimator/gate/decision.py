@@ -255,10 +255,11 @@ def _decided(
         if found and not blamed and odds >= _decisive():
             return Judgement(reason=_another_inertia(joint, weighed), left=after)
         if before > choice("unexplained"):
-            doubt = f"the motion explains {percent(1.0 - before, 0)} of the torque"
+            reason = f"the motion explains {percent(1.0 - before, 0)} of the torque"
             if before > 1.0:
-                doubt = f"what is declared leaves {percent(before, 0)} of the torque: is it a recording of this joint?"
-            return Judgement(reason=doubt, left=before)
+                left = percent(before, 0)
+                reason = f"what is declared leaves {left} of the torque: is it a recording of this joint?"
+            return Judgement(reason=reason, left=before)
         return Judgement(undecided=_undecided(joint, single, declared), left=before)
     even = -log_odds(choice("even"))
     alike = [

@@ -159,7 +159,7 @@ class Stage:
         raise AssertionError(f"not well again: { {key: document[key] for key in told} }")
 
     def forget(self) -> None:
-        self.daemon.events._lines = 0  # as in the usual hours between two faults
+        self.daemon.events._window.lines = 0  # as in the usual hours between two faults
         self.daemon.events._said.clear()  # what was said for the fault before must not count as said
         self.collector.forget()
         self.truth.forget()

@@ -85,6 +85,7 @@ def test_zenoh_cut_and_back_then_a_drive_in_fault_that_is_reset_and_one_that_reb
     rig.run(0.02)
     assert rig.controller.phase == "safe"
     kit.recovers(rig, 12.0)
+    rig.run(3.0)  # motion shows where gravity pulls, too
 
 
 @pytest.mark.parametrize("reaction", ["stop", "retract", "soften"])
@@ -107,7 +108,8 @@ def test_it_reacts_to_a_push_and_goes_on_when_it_is_gone(rig, reaction):
 
 def test_a_wall_is_not_leant_on(rig):
     rig.run(0.5)
-    truth = rig.world.truth()
+    while abs((truth := rig.world.truth()).link_velocity_rad_s) < 1.0:
+        rig.step()
     q, side = truth.link_position_rad, int(math.copysign(1, truth.link_velocity_rad_s))
     rig.world.alter(effects=[parse(f"contact=3.0,position_rad={q:.4f},side={side}")])
     assert rig.run(0.08, "react"), rig.events

@@ -63,7 +63,7 @@ PROTECTIONS = [
         ("open files", "pubsub/session.py", "    _require_files()\n    if section", "    if section", "tests/test_session.py -k too_few"),
         ("number of samples", "recording/limits.py", "if count > MAX_SAMPLES:", "if False:", f"{LIMITS} -k 'gap_of_a_million'"),
         ("size of a BLF container", "recording/blf.py", "_require(left >= 0, path)", "pass", f"{LIMITS} -k blf"),
-        ("a BLF object without a length", "recording/blf.py", "if size < _OBJECT.size:", "if False:", f"{LIMITS} -k length --timeout 20"),
+        ("answers of one object", "cycle/objectcheck.py", " and not node.waits(read[0])", "", "tests/test_read_back.py -k all_the_time"),
         ("foreign lines of a log", "recording/canlog.py", "if not understood or strange > understood + _HOPELESS:", "if not understood:", "tests/test_recording_canlog.py -k foreign"),
         ("carried joint files open nothing", "recording/mapping.py", "joint=contained(jointfile.parse(text, name))", "joint=jointfile.parse(text, name)", f"{LIMITS} -k opens_nothing"),
         ("words as plain text", "plaintext.py", '    return "" if unicodedata.category(character) in _UNSHOWABLE else character', "    return character", "tests/test_status.py -k plain_text"),

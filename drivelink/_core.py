@@ -7,6 +7,7 @@ from estimator._core import (  # noqa: F401 - drivelink/_core.pyi has their type
     STATUS_BITS,
     SYNC_COB_ID,
     Assembler,
+    BlfFrames,
     History,
     JointPipeline,
     JsonNumbers,

@@ -202,6 +202,25 @@ class McapMessage:
     @property
     def data(self) -> bytes: ...
 
+class BlfFrames:
+    """The frames in the containers of a BLF file.
+
+    Args:
+        start_ns: UNIX time of the stamp zero.
+    """
+
+    def __init__(self, start_ns: int) -> None: ...
+    def take(self, container: bytes) -> BlfFrames:
+        """Go on with another container, unpacked; its begin may be the rest of an object."""
+
+    def __iter__(self) -> BlfFrames: ...
+    def __next__(self) -> tuple[int, int, bytes, str] | None:
+        """Return stamp in ns, identifier, data and channel; None: no data frame with a short identifier.
+
+        Raises:
+            ValueError: the rest is damaged.
+        """
+
 class McapMessages:
     """The messages among the records of an MCAP file, up to a damaged one or a stamp beyond 63 bits.
 

@@ -3,11 +3,13 @@
 import itertools
 import struct
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import pytest
 from daemonkit import Listener, rig, vsa
 
-from drivelink.canopen.layout import Signal
+from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
+from drivelink.cycle.objectcheck import ObjectCheck
 from drivelink.recording.canframes import FrameLog
 from estimator.sample import Status
 
@@ -160,3 +162,19 @@ def test_a_log_in_which_a_unit_changes_gives_the_samples_of_the_run(tmp_path):
         cycle.sample for cycle in FrameLog(path, joint, tmp_path).cycles() if cycle.sample is not None
     ]
     assert str(replayed) == str(live)  # where a value is not known it is NaN
+
+
+def test_of_an_object_that_is_read_all_the_time_one_answer_waits_to_be_judged():
+    """Each was compared with forty samples: two thirds of a log's cost, and in a run somebody else's choice."""
+    judged = []
+    assembler = SimpleNamespace(sequence=0, contradict=lambda *_: None)
+    mapped = MappedObject(signal=Signal.MOTOR_POSITION, index=0x6064, subindex=0, bits=32, signed=True)
+    layout = NodeLayout(node_id=1, motor=0, tpdos=(TpdoLayout(cob_id=0x181, objects=(mapped,)),))
+    check = ObjectCheck(0.5, {1: lambda *window: judged.append(window) or []})
+    check.watch(layout, assembler)
+    for k in range(1000):
+        assembler.sequence = k
+        check.request(1, bytes.fromhex("4064600000000000"), 1e-3 * k)
+        check.response(1, bytes.fromhex("4364600000000000"), 1e-3 * k)
+        check.sync()
+    assert 40 < len(judged) < 60

@@ -82,6 +82,10 @@ class _Node:
     answers: deque[_Answer] = field(default_factory=deque)  # not judged yet
     found: Mismatch | None = None  # the value that is contradicted
 
+    def waits(self, address: Address) -> bool:
+        """Return whether an answer of an object is not judged yet."""
+        return any(answer.address == address for answer in self.answers)
+
     @cached_property
     def objects(self) -> Mapping[Address, _Object]:
         """Values, then units."""
@@ -162,7 +166,7 @@ class ObjectCheck:
 
     def undecided(self, one: _Object) -> bool:
         """Return whether an answer waits for the cycles that it is compared with."""
-        return any(answer.address == one.address for answer in self._nodes[one.node].answers)
+        return self._nodes[one.node].waits(one.address)
 
     def request(self, node_id: int, data: bytes, now_s: float) -> None:
         """Process an SDO frame of a master."""
@@ -172,9 +176,10 @@ class ObjectCheck:
             node.sniffer.request(data, now_s)
 
     def response(self, node_id: int, data: bytes, now_s: float) -> None:
-        """Process an SDO frame of a node."""
+        """Process an SDO frame of a node; an object that is read all the time is judged from time to time."""
         node = self._nodes.get(node_id)
-        if node is not None and (read := node.sniffer.response(data, now_s)) is not None:
+        read = node.sniffer.response(data, now_s) if node is not None else None
+        if node is not None and read is not None and not node.waits(read[0]):
             node.answers.append(_Answer(*read, node.asked, node.assembler.sequence))
 
     def sync(self) -> list[Mismatch]:

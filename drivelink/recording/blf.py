@@ -14,19 +14,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
+from drivelink._core import BlfFrames
 from drivelink.errors import RecordingError
 from drivelink.recording.limits import MAX_BLOCK_BYTES
 
 _FILE_HEAD = struct.Struct("<4sL32x8H")  # signature, size of the head, date and time of the first stamp
 _BASE = struct.Struct("<4s4xLL")  # signature, size, type
 _METHOD = struct.Struct("<H14x")  # of compression
-_OBJECT = struct.Struct("<6xHLLL4xQ")  # version of the head, size, type, unit of the stamp, stamp
-_CLASSIC = struct.Struct("<HBBL8s")  # channel, flags, length, identifier, data
-_FD = struct.Struct("<HBxL6xB5x64s")  # channel, flags, identifier, length, data
-_FD64 = struct.Struct("<BxBxL4xL19xB4x")  # channel, length, identifier, flags, place of what follows the data
 _CONTAINER, _DEFLATED = 10, 2
-_TEN_US = 1  # unit of a stamp; else 1 ns
-_EXTENDED, _REMOTE, _REMOTE_FD64 = 0x8000_0000, 0x80, 0x10
 _RATIO = 32  # of unpacked bytes to those of the file: of a bus at rest they are 10
 _SMALL_BYTES = 1 << 20  # that any file may unpack to
 
@@ -45,25 +40,9 @@ def blf_frames(file: IO[bytes], path: Path) -> Iterator[Frame | None]:
     if signature != b"LOGG":
         raise ValueError("no BLF file")
     file.seek(size)
-    start_ns, data, at = _nanoseconds(start), bytearray(), 0
+    frames = BlfFrames(_nanoseconds(start))
     for content in _contents(file, path):
-        del data[:at]
-        data += content  # an object may go on in the next container
-        at = 0
-        while len(data) - at >= 8:
-            begin = data.find(b"LOBJ", at, at + 8)
-            if begin < 0:
-                raise ValueError("expected an object, got something else")
-            if len(data) - begin < _OBJECT.size:
-                break
-            version, size, kind, unit, stamp = _OBJECT.unpack_from(data, begin)
-            if size < _OBJECT.size:
-                raise ValueError(f"expected no object of {size} bytes")
-            if begin + size > len(data):
-                break
-            at = begin + size
-            found = _frame(kind, data, begin, begin + (32 if version == 1 else 40), at)
-            yield found and (start_ns + stamp * (10_000 if unit == _TEN_US else 1), *found)
+        yield from frames.take(content)
 
 
 def _nanoseconds(start: list[int]) -> int:
@@ -71,7 +50,7 @@ def _nanoseconds(start: list[int]) -> int:
     year, month, _, day, hour, minute, second, milliseconds = start
     try:
         moment = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
-        return int(moment.timestamp()) * 10**9 + milliseconds * 10**6
+        return max(0, int(moment.timestamp()) * 10**9 + milliseconds * 10**6)
     except ValueError:
         return 0
 
@@ -105,23 +84,3 @@ def _require(fits: bool, path: Path) -> None:
             f"{path}: expected containers of at most {MAX_BLOCK_BYTES >> 20} MiB, "
             f"unpacked {_RATIO} times the file, got larger ones"
         )
-
-
-def _frame(kind: int, data: bytearray, begin: int, at: int, end: int) -> tuple[int, bytes, str] | None:
-    """Identifier, data and channel of an object; None: it is no such frame."""
-    if kind in (1, 86):
-        channel, flags, length, can_id, payload = _CLASSIC.unpack_from(data, at)
-        remote = flags & _REMOTE
-    elif kind == 100:
-        channel, flags, can_id, length, payload = _FD.unpack_from(data, at)
-        remote = flags & _REMOTE
-    elif kind == 101:
-        channel, length, can_id, flags, further = _FD64.unpack_from(data, at)
-        remote, at = flags & _REMOTE_FD64, at + _FD64.size
-        # Zeros that end the data may be left out.
-        payload = bytes(data[at : min(at + length, begin + further if further else end)]).ljust(length, b"\0")
-    else:
-        return None
-    return (
-        None if remote or can_id & _EXTENDED else (can_id & 0x1FFF_FFFF, payload[:length], str(channel - 1))
-    )

@@ -5,6 +5,7 @@
 #![cfg_attr(not(feature = "python"), forbid(unsafe_code))]
 
 pub mod assembler;
+pub mod blf;
 pub mod cross_check;
 pub mod frames;
 pub mod json;

@@ -1,6 +1,7 @@
 //! The extension module: `estimator._core`, with `drivelink._core`'s `Assembler`, `JointPipeline` and their results.
 
 mod assembler;
+mod blf;
 mod latency;
 mod mcap;
 mod numbering;
@@ -36,6 +37,8 @@ mod extension {
 
     #[pymodule_export]
     use super::assembler::Assembler;
+    #[pymodule_export]
+    use super::blf::BlfFrames;
     #[pymodule_export]
     use super::latency::LatencyHistogram;
     #[pymodule_export]

@@ -14,6 +14,7 @@ type Read = (Address, Py<PyBytes>);
 pub(super) struct SdoTransfers {
     core: Transfers,
     interesting: Py<PyAny>,
+    asked: Option<(Address, bool)>, // the last answer of it: most masters read one object all the time
     #[pyo3(get)]
     values: Py<PyDict>,
     #[pyo3(get)]
@@ -30,7 +31,7 @@ impl SdoTransfers {
     fn new(py: Python<'_>, interesting: Py<PyAny>, timeout_s: f64) -> PyResult<SdoTransfers> {
         let (written, disputed) = (PySet::empty(py)?.unbind(), PySet::empty(py)?.unbind());
         let (core, values) = (Transfers::new(timeout_s), PyDict::new(py).unbind());
-        Ok(SdoTransfers { core, interesting, values, written, disputed, changes: 0 })
+        Ok(SdoTransfers { core, interesting, asked: None, values, written, disputed, changes: 0 })
     }
 
     #[getter]
@@ -65,8 +66,15 @@ impl SdoTransfers {
 }
 
 impl SdoTransfers {
-    fn is_of_interest(&self, py: Python<'_>, address: Address) -> PyResult<bool> {
-        self.interesting.bind(py).call1(address)?.extract()
+    fn is_of_interest(&mut self, py: Python<'_>, address: Address) -> PyResult<bool> {
+        match self.asked {
+            Some((asked, answer)) if asked == address => Ok(answer),
+            _ => {
+                let answer = self.interesting.bind(py).call1(address)?.extract()?;
+                self.asked = Some((address, answer));
+                Ok(answer)
+            }
+        }
     }
 
     fn dispute(&mut self, py: Python<'_>, address: Address) -> PyResult<()> {

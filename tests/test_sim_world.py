@@ -280,6 +280,17 @@ def test_motors_move_differently_and_another_seed_is_another_motion(kind):
     assert not np.allclose(one, profile(table | {"seed": 1}, motors=2))
 
 
+def test_a_motion_of_more_motors_than_the_joint_has_is_refused(tmp_path):
+    names = ["time_s"] + [
+        f"motor{i}_{x}" for i in (1, 2) for x in ("torque_nm", "position_rad", "velocity_rad_s")
+    ]
+    (tmp_path / "next.csv").write_text(",".join(names) + "\n0,1,0,0,2,0,0\n1,1,0,0,2,0,0\n")
+    table = {"kind": "motion", "file": str(tmp_path / "next.csv")}
+    assert profile(table, 1.0, motors=2, motor=1)[0] == 2.0
+    with pytest.raises(SimError, match="has more motors than the joint, which has 1"):
+        build(table, 1)
+
+
 def test_offset_ramp_and_hold():
     torque = profile({"kind": "none", "offset_nm": 3.0, "ramp_s": 2.0}, 4.0)
     assert torque[:201] == pytest.approx(np.linspace(0.0, 3.0, 201))

@@ -63,15 +63,20 @@ class World:
     def _more(self, inertia: FloatArray) -> joints.More | None:
         names = (
             "coulomb_nm offset_nm cogging_nm second_nm fading_nm bump_nm constant ripple link_nm push_nm "
-            "hysteresis_nm stribeck_nm"
+            "hysteresis_nm stribeck_nm bend_nm_rad2 back_share"
         )
         v = {name: self._value(name) for name in names.split()}
         width = self._value("hysteresis_rad", 1.0)
         on = {name for name, values in v.items() if np.any(values)}
 
         def more(t: float, x: FloatArray, out: FloatArray, tau: FloatArray) -> None:
-            theta, w, _, link_w, memory = x.T
+            theta, w, q, link_w, memory = x.T
             motor = link = np.zeros(len(x))
+            if on & {"bend_nm_rad2", "back_share"}:
+                phi = q - theta
+                bent = v["bend_nm_rad2"] * np.abs(phi) * phi
+                driven = np.maximum((STIFFNESS * phi + bent) * w / np.sqrt(w * w + 4e-6), 0.0)
+                motor, link = motor + bent - v["back_share"] * driven, link - bent
             if on & {"coulomb_nm", "stribeck_nm", "fading_nm"}:
                 level = v["coulomb_nm"] + v["stribeck_nm"] * np.exp(-((w / 0.05) ** 2))
                 motor = motor - (level + v["fading_nm"] * np.exp(-t / 5.0)) * w / np.sqrt(w * w + 4e-6)

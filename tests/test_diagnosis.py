@@ -20,8 +20,9 @@ from estimator.diagnosis import diagnose
 from estimator.diagnosis.heldout import Held
 from estimator.errors import EstimatorError
 from estimator.identify import identify
-from estimator.model import Effect
+from estimator.model import Effect, JointModel
 from estimator.sample import FloatArray, Record
+from estimator.transmissions import MODELS
 from sim.world import record as simulated
 
 # What is put into each joint, and what must come out: name, location, main parameter, its tolerance.
@@ -256,7 +257,13 @@ def test_a_fault_of_installation_is_one_line(change, message, records):
 )
 def test_the_simplest_within_one_standard_error_is_chosen(gain, best, chosen, monkeypatch):
     simple, other, third = (
-        SimpleNamespace(name=name, scores=scores, terms=(), log_prior=lambda *_, prior=prior: prior)
+        SimpleNamespace(
+            name=name,
+            keys=frozenset({(name, 0)}),
+            scores=scores,
+            terms=(),
+            log_prior=lambda *_, prior=prior: prior,
+        )
         for name, scores, prior in (
             ("coulomb_friction", np.zeros(10), -6.0),
             ("asymmetric_friction", np.zeros(10) + gain, -9.0),
@@ -312,3 +319,38 @@ def test_rounding_of_a_healthy_joint_as_it_is_packaged_is_no_effect():
     joint = jointfile.load(Path(drivelink.__file__).parent / "joints" / "constant.toml")
     found = diagnose(joints.of_world(simulated(world_from_joint(joint), 40.0)), joint.model())
     assert (found.verdict, found.effects) == ("sufficient", ())
+
+
+def test_a_spring_that_is_no_polynomial_is_no_play_where_the_order_is_open():
+    """Beside an effect the order is chosen with the effect, and play is as likely as another law at most."""
+    lone, beside = kit.World([{"bend_nm_rad2": 1500.0}, {"bend_nm_rad2": 1500.0, "cogging_nm": 0.6}]).run()
+    free = _open_polynomial(kit.model())
+    assert all(f.name == "backlash" and f.probability <= 0.5 for f in diagnose(lone, free).effects)
+    found = diagnose(beside, free)
+    assert [f.name for f in found.effects] == ["cogging"]
+    (spring,) = found.transmissions
+    law, phi = MODELS["polynomial"], np.linspace(0.01, 0.06, 6)
+    stiffness = law.stiffness(phi, law.alpha(spring.parameters))
+    assert stiffness == pytest.approx(kit.STIFFNESS + 3000.0 * phi, rel=0.03)
+
+
+def test_no_order_is_chosen_whose_coefficients_no_joint_file_holds():
+    """Of a stiff joint: a thousandth of the deflection, and so of the motion."""
+    (record,) = kit.World([{"bend_nm_rad2": 1500.0}]).run()
+    assert record.link_position_rad is not None
+    (motor,) = kit.model(linked=False).motors
+    stiff = replace(motor, inertia_kg_m2=1e3 * kit.INERTIA, viscous_damping_nm_s_rad=1e3 * kit.DAMPING)
+    small = replace(
+        record,
+        motor_position_rad=1e-3 * record.motor_position_rad,
+        link_position_rad=1e-3 * record.link_position_rad,
+    )
+    free = _open_polynomial(replace(kit.model(linked=False), motors=(stiff,)))
+    coefficients = identify(small, free).model.motors[0].transmission.parameters["coefficients_nm_rad"]
+    assert isinstance(coefficients, tuple) and coefficients[0] == pytest.approx(1e3 * kit.STIFFNESS, rel=0.2)
+
+
+def _open_polynomial(model: JointModel) -> JointModel:
+    (motor,) = model.motors
+    own = replace(motor.transmission, model="polynomial")
+    return replace(model, motors=(replace(motor, transmission=own),))

@@ -71,26 +71,38 @@ def test_an_effect_that_moves_the_stiffness_is_in_the_interval_of_a_fit():
     """Undeclared hysteresis, which stiffens the joint in all parts of the motion alike."""
     missing = [{"hysteresis_nm": nm, "hysteresis_rad": rad} for nm, rad in ((0.6, 0.01), (2.0, 0.05))]
     for record in kit.World(missing).run():
-        (found,) = fit(record, kit.model(linked=False))
-        k, std = found.parameters["k_nm_rad"], found.std["k_nm_rad"]
-        assert isinstance(k, float) and isinstance(std, float)
+        k, std = _stated(record, kit.model(linked=False))
         assert 0.04 < k / kit.STIFFNESS - 1.0 < SIGMA_95 * std / kit.STIFFNESS
 
 
-def test_a_torque_gain_that_drifts_is_in_the_interval_of_a_fit_and_a_healthy_drive_widens_none():
+@pytest.mark.parametrize("linked", [True, False])
+def test_a_torque_gain_that_drifts_is_in_the_interval_of_a_fit_and_a_healthy_drive_widens_none(linked):
     """The inertias follow the gain, and with them the stiffness."""
     (record,) = kit.World([{}]).run()
     gain = 1.0 + 0.1 * np.expm1(-np.arange(len(record)) * kit.PERIOD_S / 4.0)
     warm = replace(record, motor_torque_nm=record.motor_torque_nm / gain[:, None])
     off, half = [], []
     for one in (record, warm):
-        (found,) = fit(one, kit.model())
-        k, std = found.parameters["k_nm_rad"], found.std["k_nm_rad"]
-        assert isinstance(k, float) and isinstance(std, float)
+        k, std = _stated(one, kit.model(linked=linked))
         off.append(k / kit.STIFFNESS - 1.0)
         half.append(SIGMA_95 * std / kit.STIFFNESS)
     assert half[0] < 0.005
     assert 0.04 < off[1] < half[1] < 0.3
+
+
+def test_a_loss_while_the_link_drives_is_in_the_interval_of_a_fit():
+    """Half of it both ways, and a softer spring, leave the same."""
+    (record,) = kit.World([{"back_share": 0.15}]).run()
+    k, std = _stated(record, kit.model())
+    assert 0.05 < 1.0 - k / kit.STIFFNESS < SIGMA_95 * std / kit.STIFFNESS < 0.2
+
+
+def _stated(record: Record, model: JointModel) -> tuple[float, float]:
+    """K and its standard deviation by `fit`."""
+    (found,) = fit(record, model)
+    k, std = found.parameters["k_nm_rad"], found.std["k_nm_rad"]
+    assert isinstance(k, float) and isinstance(std, float)
+    return k, std
 
 
 def test_where_a_torque_rests_on_its_limit_more_may_have_acted():

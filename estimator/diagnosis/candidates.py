@@ -31,9 +31,10 @@ AGAIN = "'"  # behind the name of a further ripple of the same kind
 
 # Laws of friction and hysteresis with memory: Dahl, Bouc-Wen, elastic up to the limit.
 LAWS = ((1.0, 1.0), (2.0, 0.5), (50.0, 1.0))
-# Without a second equation the torque's scale cannot be separated from inertia and stiffness.
 _FREE_ZEROS = ("torque_offset", "deflection_offset")  # fitted anyway where nothing ties them
-_SCALES = ("torque_constant", "torque_saturation", "torque_drift")
+# Without a second equation the torque's scale cannot be separated from inertia and stiffness, nor one that
+# depends on the torque from the spring's law; one that changes with time can.
+_SCALES = ("torque_constant", "torque_saturation")
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,9 @@ from estimator.sample import FloatArray, Record
 __all__ = ["Held", "Residual", "errors_of", "held_out", "residual_of", "wider"]
 
 
+_TWINS = ("load_dependent_friction", "back_driving_loss")
+
+
 class Residual(NamedTuple):
     """What a model leaves of some rows.
 
@@ -132,21 +135,23 @@ class Held:
         parts = np.array_split(square, whole("groups"), axis=1)
         return np.array([np.mean(part, axis=1) for part in parts])
 
-    def confirms(self, found: Fitted, rest: Fitted) -> bool:
+    def confirms(self, found: Fitted, rest: Fitted, of: Held | None = None) -> bool:
         """Return whether held-out data need what one model has beyond another: the one rule of acceptance.
+
+        `of`: the same data under another declared model, which the other one is of.
 
         The mean score of the blocks rises by more than its standard error, and the error falls by more than
         filters and rounding leave anyway; by more than a law leaves, for a law of the same phenomenon with
         more parameters.
         """
-        return self.margin(found, rest) > 1.0
+        return self.margin(found, rest, of) > 1.0
 
-    def margin(self, found: Fitted, rest: Fitted) -> float:
+    def margin(self, found: Fitted, rest: Fitted, of: Held | None = None) -> float:
         """Return how many times more than `confirms` asks for one model gains over another."""
         floor = rest.regression.floor if self._refines(found, rest) else self.problem.floor
-        fall = (self.squared(rest) - self.squared(found)) / float(np.mean(self._relative(floor)))
-        both = found, rest
-        return min(fall, _in_errors(self.scores(found, both) - self.scores(rest, both)))
+        theirs, both = of or self, (found, rest)
+        fall = (theirs.squared(rest) - self.squared(found)) / float(np.mean(self._relative(floor)))
+        return min(fall, _in_errors(self.scores(found, both) - theirs.scores(rest, both)))
 
     def _refines(self, one: Fitted, other: Fitted) -> bool:
         """Whether a model has laws of the same phenomena with more parameters, also than are declared."""
@@ -220,7 +225,33 @@ class Held:
         as_likely = np.array(self._preferred(found, models))
         prior = np.where(as_likely, np.maximum(prior, found.log_prior(errors, self.price)), prior)
         odds = np.clip(errors * (shares @ gain.T), least, most) + prior
+        for pair in self._twins(models):
+            sizes = [models[k].log_size(name) for k, name in zip(pair, _TWINS, strict=True)]
+            odds[:, pair] = np.max(odds[:, pair], axis=1, keepdims=True) + sizes - max(sizes)
         return np.asarray(np.mean(softmax(odds, axis=1), axis=0))
+
+    def _twins(self, models: Sequence[Fitted]) -> list[list[int]]:
+        """Pairs of models that are one where nothing but a motor's balance tells the stiffness.
+
+        A loss c of the torque while the link drives leaves k and k (1 - c), the motor driving and driven; a
+        loss of c/2 both ways with a stiffness of k (1 - c/2) leaves the same. Unless they differ by more than
+        laws leave, the prior of its size decides.
+        """
+        keys = [one.keys for one in models]
+        pairs = [
+            [keys.index(other), k]
+            for k, own in enumerate(keys)
+            for name, motor in own
+            if name == _TWINS[1] and (other := own - {(name, motor)} | {(_TWINS[0], motor)}) in keys
+        ]
+        if not pairs or (self.problem.frames[0].linked and not self.problem.calibrating):
+            return []
+        return [pair for pair in pairs if self._differ(*(models[k] for k in pair)) < 1.0]
+
+    def _differ(self, one: Fitted, other: Fitted) -> float:
+        """Difference of the squared errors of two models, over what their laws leave anyway."""
+        floor = np.maximum(one.regression.floor, other.regression.floor)
+        return abs(self.squared(one) - self.squared(other)) / float(np.mean(self._relative(floor)))
 
     def _independent(self, like: Fitted) -> float:
         """Number of independent errors in each balance of all blocks."""

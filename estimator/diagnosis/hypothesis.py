@@ -94,6 +94,11 @@ class Fitted:
         effects = price * len(self.keys) + 0.5 * self.parameters * math.log(max(errors, 1.0))
         return -0.5 * float(off @ off) - effects
 
+    def log_size(self, name: str) -> float:
+        """Return the logarithm of the prior density of an effect's size, up to a constant."""
+        off = [(x, j) for j, (slot, x) in enumerate(self._off()) if (slot.kind, slot.name) == ("term", name)]
+        return -sum(0.5 * x * x + math.log(float(self.regression.std[j])) for x, j in off)
+
     def is_real_beside(self, parent: Fitted) -> bool:
         """Return whether every effect contributes, none at an end of the motion, and no spring is at zero
         that has a stiffness in the parent.

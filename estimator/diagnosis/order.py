@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
+from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Finding
 from estimator.model import HIGHEST_ORDER, JointModel, Transmission
+from estimator.ranges import range_of
 
-__all__ = ["bends", "ordered"]
+__all__ = ["bends", "ordered", "ordered_beside"]
+
+Make = Callable[[JointModel, Problem | None], Problem]
+_CURVES = ("higher_order_stiffness", "backlash")  # odd, as a polynomial is
 
 
 def _is_open(own: Transmission) -> bool:
@@ -22,15 +27,13 @@ def _is_open(own: Transmission) -> bool:
 def bends(model: JointModel, effects: Iterable[Finding]) -> bool:
     """Return whether a diagnosis has found a curve of the deflection, of which the order is open."""
     return any(
-        (f.name == "higher_order_stiffness" or f.coordinates[:1] == ("deflection",))
+        (f.name in _CURVES or f.coordinates[:1] == ("deflection",))
         and _is_open(model.motors[f.motor or 0].transmission)
         for f in effects
     )
 
 
-def ordered(
-    model: JointModel, make: Callable[[JointModel, Problem | None], Problem]
-) -> tuple[Problem, Fitted]:
+def ordered(model: JointModel, make: Make) -> tuple[Problem, Fitted]:
     """Return the best fit; each open order is raised for as long as the evidence rises (eq 24).
 
     Args:
@@ -38,17 +41,49 @@ def ordered(
         make: the problem of a model, like another one.
     """
     problem = make(model, None)
-    fitted = problem.null()
-    for i, motor in enumerate(model.motors):
-        if not _is_open(motor.transmission):
-            continue
-        for order in range(1, HIGHEST_ORDER + 1):
-            own = replace(motor, transmission=replace(motor.transmission, order=order))
-            motors = (*problem.model.motors[:i], own, *problem.model.motors[i + 1 :])
-            one = make(replace(problem.model, motors=motors), problem)
-            raised = one.null()
-            closest = min((fitted, raised), key=lambda h: float(np.sum(np.log(h.posterior.sigma))))
-            if order > 1 and raised.evidence(closest) <= fitted.evidence(closest):
+    found = problem, problem.null()
+    for i in _open(model):
+        orders = _orders(found[0], i, make, None)
+        found = next(orders)
+        for problem, raised in orders:
+            closest = min((found[1], raised), key=lambda h: float(np.sum(np.log(h.posterior.sigma))))
+            if raised.evidence(closest) <= found[1].evidence(closest):
                 break
-            problem, fitted = one, raised
-    return problem, fitted
+            found = problem, raised
+    return found
+
+
+def ordered_beside(model: JointModel, make: Make, hold: Callable[[Problem], Held], beside: Fitted) -> Problem:
+    """Return the problem with each open order the lowest that held-out data do not surely raise.
+
+    Args:
+        model: the joint.
+        make: the problem of a model, like another one.
+        hold: the data held out of a problem.
+        beside: a hypothesis, of which all effects but curves of the deflection are there too.
+    """
+    problem = make(model, None)
+    for i in _open(model):
+        orders = [(hold(one), fitted) for one, fitted in _orders(problem, i, make, beside)]
+        best, most = max(orders, key=lambda pair: float(np.mean(pair[0].scores(pair[1]))))
+        problem = next(held.problem for held, fitted in orders if not best.confirms(most, fitted, held))
+    return problem
+
+
+def _open(model: JointModel) -> list[int]:
+    return [i for i, motor in enumerate(model.motors) if _is_open(motor.transmission)]
+
+
+def _orders(problem: Problem, i: int, make: Make, beside: Fitted | None) -> Iterator[tuple[Problem, Fitted]]:
+    """The fit of each order of a motor's polynomial whose coefficients a joint file holds."""
+    model, most = problem.model, range_of("coefficients_nm_rad").most
+    for order in range(1, HIGHEST_ORDER + 1):
+        own = replace(model.motors[i], transmission=replace(model.motors[i].transmission, order=order))
+        one = make(replace(model, motors=(*model.motors[:i], own, *model.motors[i + 1 :])), problem)
+        fitted = one.null()
+        terms = () if beside is None else tuple(t for t in beside.terms if not t.candidate.bends)
+        if beside is not None and terms:
+            fitted = one.fit(terms, fitted.base, beside.corrections)
+        if order > 1 and float(np.max(np.abs(fitted.moved_base(one.frames[0]).alpha[i]))) > most:
+            return
+        yield one, fitted

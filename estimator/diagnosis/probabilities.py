@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,9 +45,13 @@ def believed(held: Held, found: Fitted, others: Sequence[Fitted]) -> Fitted:
     return max((pair for pair in every if pair[1].named <= found.named), key=lambda pair: pair[0])[1]
 
 
-def _twins(key: tuple[str, int | None], beside: Keys, linked: bool) -> list[str]:
+def _twins(
+    key: tuple[str, int | None], beside: Keys, linked: bool, polynomial: Container[int | None]
+) -> list[str]:
     """What no motion tells from an effect beside others."""
     name, motor = key
+    if name == "backlash" and motor in polynomial:
+        return ["higher_order_stiffness"]  # a polynomial is no law: one that bends otherwise looks like play
     if name == "motor_inertia" and not linked:
         return ["torque_constant"]  # without a second balance the scales of torque and inertia are one
     both = {("coulomb_friction", motor), ("torque_offset", motor)}
@@ -56,13 +60,19 @@ def _twins(key: tuple[str, int | None], beside: Keys, linked: bool) -> list[str]
     return ["torque_offset"] if name == "asymmetric_friction" else []
 
 
-def chances(found: Fitted, beside: Sequence[tuple[float, Fitted]], linked: bool) -> Chances:
+def chances(
+    found: Fitted,
+    beside: Sequence[tuple[float, Fitted]],
+    linked: bool,
+    polynomial: Container[int | None] = (),
+) -> Chances:
     """Return the probability of each effect that any account has.
 
     Args:
         found: the hypothesis.
         beside: all accounts.
         linked: whether there are two balances.
+        polynomial: motors whose spring is a polynomial with nothing known of it.
     """
     made: dict[Key, float] = {}
     for weight, one in beside:
@@ -70,25 +80,30 @@ def chances(found: Fitted, beside: Sequence[tuple[float, Fitted]], linked: bool)
             made[key] = made.get(key, 0.0) + weight
     shared: dict[Key, float] = {}
     for name, motor in found.keys:
-        for twin in _twins((name, motor), found.keys, linked):
+        for twin in _twins((name, motor), found.keys, linked, polynomial):
             made[name, motor] /= 2.0
             shared[twin, motor] = max(shared.get((twin, motor), 0.0), made[name, motor])
-    return made | {key: made.get(key, 0.0) + p for key, p in shared.items()}
+    return made | {key: min(made.get(key, 0.0) + p, 1.0) for key, p in shared.items()}
 
 
 def standing(
-    found: Fitted, k: int, beside: Sequence[tuple[float, Fitted]], chance: Chances, linked: bool
+    found: Fitted,
+    k: int,
+    beside: Sequence[tuple[float, Fitted]],
+    chance: Chances,
+    linked: bool,
+    polynomial: Container[int | None] = (),
 ) -> Standing:
     """Return the probability and alternatives of the k-th effect found: what accounts have in its place.
 
     Args:
         found: the hypothesis. k: which of its effects.
         beside: all accounts. chance: what `chances` says of them.
-        linked: whether there are two balances.
+        linked, polynomial: as there.
     """
     key = found.terms[k].candidate.key
     own = {name.rstrip(AGAIN) for name, _ in found.keys}
-    instead = dict.fromkeys(_twins(key, found.keys, linked), chance[key])
+    instead = dict.fromkeys(_twins(key, found.keys, linked, polynomial), chance[key])
     for weight, one in beside:
         if key not in one.named:
             for name in {name.rstrip(AGAIN) for name, _ in one.keys} - own:

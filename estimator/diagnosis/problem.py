@@ -89,7 +89,12 @@ class Problem:
         )
 
     def _least(self) -> FloatArray:
-        """(groups,) what filters leave of the torque anyway, and rounding of the springs', N·m."""
+        """(groups,) what filters leave of the torque anyway, and rounding of the springs', N·m.
+
+        Next to nothing in a fit: it names no effect, and below these errors a stiffness is still found.
+        """
+        if self.calibrating:
+            return np.full(len(self.frames) * self.equations, choice("exact") * self.torque_rms)
         made: list[float] = []
         for frame in self.frames:
             motors = with_flexibility(frame, self._begin).motors
@@ -261,7 +266,7 @@ class Problem:
             np.array(stack.std),
             np.array(stack.low),
             self.group,
-            np.full(groups, choice("exact") * self.torque_rms) if self.calibrating else self.floor,
+            self.floor,
             stack.scales(terms),
         )
         times = np.ones(groups)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import softmax
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import Candidate, columns, grid, members
@@ -94,6 +93,15 @@ def _gain(precision: FloatArray, side: FloatArray) -> FloatArray:
     at = np.linalg.solve(np.where(sound[..., None, None], precision, np.eye(side.shape[-1])), side[..., None])
     gain = 0.5 * np.einsum("...i,...i", side, at[..., 0]) - 0.5 * logdet
     return np.where(sound & np.isfinite(gain), gain, -np.inf)
+
+
+def _change(one: Fitted, other: Fitted) -> FloatArray:
+    """(k,) of the columns of one hypothesis, what they are in another beyond it."""
+    here, there = (
+        {slot[:-1]: slot.taken + float(x) for slot, x in zip(h.slots, h.posterior.x, strict=True)}
+        for h in (one, other)
+    )
+    return np.array([there.get(key, x) - x for key, x in here.items()])
 
 
 class Search:
@@ -284,9 +292,9 @@ class Search:
         always driven in one direction looks like a softer spring. It adds the covariance of the larger model
         minus that of the hypothesis (consider covariance; S. F. Schmidt, Advances in Control Systems 3,
         1966). Families of effects are independent contributions (JCGM 100, 5.1.2); of the laws of one family
-        the largest contribution counts. An effect that the data support also changes x: the squares of these
-        changes are added, each with the probability of its effect (Bayesian model averaging; Hoeting et al.,
-        Statistical Science 14, 1999), as the residual has one explanation.
+        the largest contribution counts. An effect that the data support also changes x: fitted beside the
+        rest, as a linear step would shrink the torque that a drive's effect explains. The squares of these
+        changes are added by the hypotheses' weights (`Held.weights`), as the residual has one explanation.
 
         Args:
             parent: the hypothesis.
@@ -300,35 +308,24 @@ class Search:
         """
         families: dict[tuple[object, ...], FloatArray] = {}
         nothing = np.zeros_like(parent.posterior.covariance)
-        odds, apart = [0.0], [nothing]
+        supported = []
         for one in self._library_beside(parent):
             candidate = one.candidate
             drive = self.problem.calibrating and candidate.kind.channel == "motor_torque"
             best = one.independent(effect)
             if drive and (candidate.kind.name == "torque_constant" or best.gain <= 0.0):
                 continue
-            gain, change = self._refitted(parent, one, effect) if drive else (best.gain, best.change)
-            odds.append(gain - math.log(one.points) - self.held.price)
-            apart.append(np.outer(change, change) if math.isfinite(gain) else nothing)
+            if best.gain > 0.0:
+                supported.append(self._grown(parent, Term(candidate, dict(one.values))))
             more = nothing if candidate.bends or drive else best.covariance
             _, *family = candidate.family  # either side of the motor's balance is the same to it
             before = families.get(tuple(family), nothing)
             families[tuple(family)] = max(more, before, key=lambda x: float(x[place, place]))
-        between = np.tensordot(softmax(odds), apart, axes=1)
+        models = [parent, *supported]
+        best_of = max(models, key=lambda h: float(np.mean(self.held.scores(h))))
+        apart = [np.outer(x, x) for x in (_change(parent, one) for one in models)]
+        between = np.tensordot(self.held.weights(models, best_of), apart, axes=1)
         return np.asarray(sum(families.values(), between))
-
-    def _refitted(self, parent: Fitted, one: _Tried, effect: float) -> tuple[float, FloatArray]:
-        """(gain of evidence, change of x) by an effect of a drive.
-
-        A linear step would shrink the torque that it explains.
-        """
-        child = self._grown(parent, Term(one.candidate, dict(one.values)))
-        then, now = (
-            {slot[:-1]: slot.taken + float(x) for slot, x in zip(h.slots, h.posterior.x, strict=True)}
-            for h in (parent, child)
-        )
-        gain = child.evidence(parent) - parent.posterior.evidence
-        return min(gain, gain / effect), np.array([now.get(key, x) - x for key, x in then.items()])
 
     def _library_beside(self, parent: Fitted) -> Iterator[_Tried]:
         """All additional effects, linearised, each at the most promising point of its grid."""

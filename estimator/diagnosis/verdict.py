@@ -71,10 +71,11 @@ class Judge:
         curve = best_curve(self.search, self.search.null)
         seen = [*self.search.seen, *([] if curve is None else [curve])]
         beside = accounts(self.held, self.found, seen)
-        linked = self.problem.frames[0].linked
-        chance = chances(self.found, beside, linked)
+        linked, springs = self.problem.frames[0].linked, [m.transmission for m in self.problem.model.motors]
+        unknown = [i for i, own in enumerate(springs) if own.model == "polynomial" and not own.parameters]
+        chance = chances(self.found, beside, linked, unknown)
         terms = range(len(self.found.terms))
-        standings = [standing(self.found, k, beside, chance, linked) for k in terms]
+        standings = [standing(self.found, k, beside, chance, linked, unknown) for k in terms]
         effects = findings_of(self.search, self.found, standings, self.surplus)
         return self._stated(self._judged(effects, curve), beside, chance)
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from estimator.choices import least_rows
 from estimator.diagnosis.bandwidth import choose_bandwidth, widest
-from estimator.diagnosis.heldout import held_out
-from estimator.diagnosis.order import bends, ordered
+from estimator.diagnosis.heldout import Held, held_out
+from estimator.diagnosis.order import bends, ordered_beside
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
@@ -58,9 +58,25 @@ def diagnose(
     def made(model: JointModel, like: Problem | None = None) -> Problem:
         return Problem(records, model, bandwidth, least=least_rows(), like=like)
 
-    problem = made(model)
-    search = Search(problem, held_out(problem, validation), progress)
-    outcome = Judge(search, search.run(), progress).diagnosis()
-    if bends(model, outcome.effects):
-        return diagnose(records, ordered(model, made)[0].model, bandwidth, validation, progress)
+    def hold(problem: Problem) -> Held:
+        return held_out(problem, validation)
+
+    def judged(problem: Problem) -> tuple[Judge, Diagnosis]:
+        search = Search(problem, hold(problem), progress)
+        judge = Judge(search, search.run(), progress)
+        return judge, judge.diagnosis()
+
+    judge, outcome = judged(made(model))
+    while bends(model, outcome.effects):
+        problem = ordered_beside(model, made, hold, judge.found)
+        if _orders(problem.model) == _orders(judge.problem.model):
+            break
+        other, raised = judged(problem)
+        if judge.held.confirms(judge.found, other.found, other.held):
+            break
+        judge, outcome = other, raised
     return outcome
+
+
+def _orders(model: JointModel) -> list[int]:
+    return [motor.transmission.order or 1 for motor in model.motors]

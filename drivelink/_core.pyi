@@ -277,6 +277,10 @@ class SdoTransfers:
     def pending(self) -> tuple[int, int] | None:
         """The object being written, not yet confirmed."""
 
+    @property
+    def is_mapping(self) -> bool:
+        """Whether that is a parameter of a TPDO."""
+
     def drop_transfer(self) -> None:
         """Forget the present transfer."""
 

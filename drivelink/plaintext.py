@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import difflib
+import html
 import logging
 import os
 import re
@@ -29,6 +30,11 @@ def clean_text(text: str, length: int = MAX_TEXT) -> str:
     if not text.isascii() or not text.isprintable():
         text = "".join(_shown(character) for character in text)
     return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def for_page(text: str) -> str:
+    """Return a text of any length as one of a page, in attributes too."""
+    return html.escape(clean_text(text, len(text)))
 
 
 def some(names: Iterable[object], length: int = _ROOM) -> str:

@@ -17,10 +17,11 @@ from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.jointfile.apply_diagnosis import floor_entry, make_model_monitor
 from drivelink.output import plots, progress, report
-from drivelink.output.document import Grid, Section, show
+from drivelink.output.document import Document, Grid, Section, page, show
 from drivelink.output.numbers import Units
 from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
 from drivelink.output.progress import Meter
+from drivelink.plaintext import for_page
 from estimator.diagnosis import Errors
 from estimator.reasons import percent
 
@@ -166,6 +167,14 @@ def test_a_name_with_a_control_character_is_drawn_without_it(tmp_path):
     xy(axes, {"\x1bcurve": PlotCurve(np.arange(3.0), np.arange(3.0))}, "x", "y", "\x9bt")
     assert b"\x1b" not in save(figure, tmp_path / "x.svg").read_bytes()
     assert figure.get_suptitle().endswith("a name\nof two lines")
+
+
+def test_words_in_a_page_are_text_without_what_turns_or_hides_them():
+    """Names of files and joints are anybody's."""
+    name = "<img src=x>\x1b]0;own\x07\x9b31m\u202egpj.exe"
+    made = page(Document(title=name, about=name, sections=[]))
+    assert made.count("&lt;img src=x&gt;]0;own31mgpj.exe") >= 2 and "<img" not in made
+    assert for_page(name + '"') == "&lt;img src=x&gt;]0;own31mgpj.exe&quot;"
 
 
 def test_what_is_not_finite_or_constant_or_empty_can_be_drawn(tmp_path):

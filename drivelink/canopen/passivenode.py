@@ -100,8 +100,7 @@ class PassiveNode:
     @property
     def being_mapped(self) -> bool:
         """Whether the master is changing its mapping now."""
-        pending = self.listener.pending
-        return pending is not None and is_mapping(pending)
+        return self.listener.is_mapping
 
     def layout(self) -> tuple[NodeLayout, str]:
         """Return the best known layout, and why it is not trusted (empty: it is).

@@ -133,7 +133,7 @@ def _run(args: argparse.Namespace) -> int:
     joints = Joints.load(args.joints)
     sources, empty = storage.find(args.recordings)
     for pattern in empty:
-        print(f"{pattern}: no recording there", file=sys.stderr)
+        print(clean_text(f"{pattern}: no recording there"), file=sys.stderr)
     if not sources:
         raise UsageError("RECORDINGS: expected at least one recording, found none")
     said = 0

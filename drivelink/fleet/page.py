@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from drivelink.fleet.summary import LOOK, STATES, parameter_name, spaced
 from drivelink.output.document import Block, Document, Grid, Markup, Paragraph, Rows, Section, drawn
 from drivelink.output.document import page as draw
 from drivelink.output.numbers import number, ticks_each, with_interval
-from drivelink.plaintext import natural
+from drivelink.plaintext import for_page, natural
 from estimator.effects import in_words
 from estimator.sample import SIGMA_95
 
@@ -131,13 +130,13 @@ def _about(document: dict[str, Any]) -> str:
 
 
 def _line(joint: dict[str, Any], order: str, linked: bool) -> str:
-    name, state = html.escape(joint["joint"]), joint["state"]
+    name, state = for_page(joint["joint"]), joint["state"]
     link = f'<a href="#{name}">{name}</a>' if linked else name
     spark = "".join(_spark(joint, one) for one in joint["transmissions"])
     return (
         f'<tr class="is-{state}" style="{order}"><th>{link}</th>'
         f'<td><span class="state {state}">{state}</span></td>'
-        f'<td>{html.escape(joint["sentence"])}</td><td class="spark">{spark}</td></tr>\n'
+        f'<td>{for_page(joint["sentence"])}</td><td class="spark">{spark}</td></tr>\n'
     )
 
 
@@ -155,13 +154,13 @@ def _spark(joint: dict[str, Any], one: dict[str, Any]) -> str:
 
 
 def _details(joint: dict[str, Any], order: str) -> str:
-    name = html.escape(joint["joint"])
+    name = for_page(joint["joint"])
     charts = "".join(_figure(joint, one) for one in joint["transmissions"])
     others = "".join(_small(joint, one) for one in joint["parameters"])
     opened = " open" if joint["state"] in LOOK else ""
     return (
         f'<details id="{name}" class="joint is-{joint["state"]}" style="{order}"{opened}>'
-        f"<summary><b>{name}</b>{html.escape(joint['sentence'])}</summary>"
+        f"<summary><b>{name}</b>{for_page(joint['sentence'])}</summary>"
         f'{charts}<div class="small">{others}</div>{drawn(_effects(joint))}{_diagnoses(joint)}</details>\n'
     )
 
@@ -181,7 +180,7 @@ def _small(joint: dict[str, Any], one: dict[str, Any]) -> str:
         words.append(f"motor {one['motor']}")
     return (
         f'<figure><svg viewBox="0 0 {0.5 * _WIDTH:g} 132" role="img">{body}</svg>'
-        f"<figcaption>{html.escape(', '.join(filter(None, words)))}</figcaption></figure>"
+        f"<figcaption>{for_page(', '.join(filter(None, words)))}</figcaption></figure>"
     )
 
 
@@ -195,7 +194,7 @@ def _figure(joint: dict[str, Any], one: dict[str, Any]) -> str:
         "recording that shows no stiffness, a hollow dot a model that was not sufficient, a dot below the "
         "axis an effect that was found at that place. A click opens the diagnosis."
     )
-    return f'<figure class="large">{charts}<figcaption>{html.escape(caption)}</figcaption></figure>'
+    return f'<figure class="large">{charts}<figcaption>{for_page(caption)}</figcaption></figure>'
 
 
 def _chart(joint: dict[str, Any], one: dict[str, Any], width: float, name: str) -> str:
@@ -216,7 +215,7 @@ def _missing(joint: dict[str, Any], one: dict[str, Any], frame: _Frame, *, linke
         if row["transmission"] not in (None, one["transmission"]):
             continue
         x, y, r = frame.x(row["time"]), frame.height - 6.0, 3.5
-        title = f"<title>{html.escape(_minute(row['time']) + ': ' + row['reason'])}</title>" if linked else ""
+        title = f"<title>{for_page(_minute(row['time']) + ': ' + row['reason'])}</title>" if linked else ""
         cross = f"M{x - r:.1f} {y - r:.1f}l{2 * r} {2 * r}m0 {-2 * r}l{-2 * r} {2 * r}"
         mark = f'<path class="cross" d="{cross}">{title}</path>'
         parts.append(_link(row["report"], mark) if linked else mark)
@@ -288,7 +287,7 @@ def _points(one: dict[str, Any], frame: _Frame) -> str:
 def _strip(joint: dict[str, Any], effect: dict[str, Any], frame: _Frame, y: float) -> str:
     """Return one line below the chart: recordings in which an effect was found at a location."""
     kind = "found new" if effect["significant"] else "found"
-    place = html.escape(spaced(effect["location"]))
+    place = for_page(spaced(effect["location"]))
     parts = [f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{place}</text>']
     for one in joint["diagnoses"]:
         names = [name for name in one["effects"] if name.endswith(f"@{effect['location']}")]
@@ -299,7 +298,7 @@ def _strip(joint: dict[str, Any], effect: dict[str, Any], frame: _Frame, y: floa
 
 
 def _dot(x: float, y: float, kind: str, tip: str = "", radius: float = 3.4) -> str:
-    title = f"<title>{html.escape(tip)}</title>" if tip else ""
+    title = f"<title>{for_page(tip)}</title>" if tip else ""
     where = f'cx="{x:.1f}" cy="{y:.1f}" r="{radius}"'
     return f'<circle class="{kind}" {where}>{title}</circle>'
 
@@ -307,8 +306,8 @@ def _dot(x: float, y: float, kind: str, tip: str = "", radius: float = 3.4) -> s
 def _link(report: str, body: str, tip: str = "") -> str:
     if not _REPORT.fullmatch(report):  # the table is data: no other scheme, host or folder
         return body
-    title = f' title="{html.escape(tip)}"' if tip else ""
-    return f'<a href="{html.escape(report)}"{title}>{body}</a>'
+    title = f' title="{for_page(tip)}"' if tip else ""
+    return f'<a href="{for_page(report)}"{title}>{body}</a>'
 
 
 def _minute(time: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import mimetypes
 from importlib.resources import files
@@ -11,6 +10,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 from drivelink.loop import day
 from drivelink.loop.finding import finding_file, kept, page_file
+from drivelink.plaintext import for_page
 
 _MOST_ROWS = 1500  # of a plot
 
@@ -30,7 +30,7 @@ class WebDay:
         asked = urlsplit(path).path
         if asked == "/day":
             text = files("drivelink.monitor").joinpath("day.html").read_text(encoding="utf-8")
-            page = text.replace("{{joint}}", html.escape(self._joint))
+            page = text.replace("{{joint}}", for_page(self._joint))
             return "text/html; charset=utf-8", page.encode()
         if asked == "/day.json":
             return "application/json", self._data(path)

@@ -243,7 +243,7 @@ def _cell(cell: Cell) -> str:
 
 
 def _escaped(text: str) -> str:
-    return markup.escape(text, quote=False)
+    return markup.escape(clean_text(text, len(text)), quote=False)
 
 
 def cell_text(cell: Cell) -> str:

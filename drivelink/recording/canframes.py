@@ -41,7 +41,7 @@ _LOG = logging.getLogger("drivelink.recording")
 
 _QUIET_SYNCS = 500  # without a change, the configuration has ended
 _MOST_HELD = 1 << 18  # frames among them: more than a bus of 127 nodes sends
-_WITHOUT_SYNC = 100_000  # frames at the beginning: half a minute of a bus whose master does not run yet
+_WITHOUT_SYNC = 100_000  # frames: half a minute of a bus whose master does not run
 _FEW_MAPPINGS = 5000  # changes of what a node sends that any file may have: to configure one makes dozens
 _RECORDS_OF_A_MAPPING = 64  # of the file, for each further one: it costs as much as dozens of them
 _PEEK = 20_000  # messages that show whether an MCAP file has samples
@@ -162,10 +162,11 @@ class FrameLog:
         """
         listener, head = self._listener, self._head
         syncs: deque[int] = deque(maxlen=2 * _QUIET_SYNCS)
-        quiet, heard, before = 0, False, False
-        for number, frame in enumerate(self._frames):
+        quiet, heard, before, without = 0, False, False, 0
+        for frame in self._frames:
             stamp_ns, can_id, data, _ = frame
-            if not syncs and number > _WITHOUT_SYNC:
+            without += 1
+            if without > _WITHOUT_SYNC and not (syncs and listener.busy):
                 break
             if not listener.busy:
                 head.append(frame)
@@ -173,6 +174,7 @@ class FrameLog:
                     break
             if can_id == SYNC_COB_ID:
                 syncs.append(stamp_ns)
+                without = 0
                 quiet += 1
                 if quiet > _QUIET_SYNCS and not listener.busy:
                     break

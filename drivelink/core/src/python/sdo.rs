@@ -44,6 +44,12 @@ impl SdoTransfers {
         self.core.pending()
     }
 
+    /// Whether the transfer under way is of a parameter of a TPDO (CiA 301, 7.5.2.37 and 38).
+    #[getter]
+    fn is_mapping(&self) -> bool {
+        self.core.pending().is_some_and(|(index, _)| (0x1800..=0x1BFF).contains(&index))
+    }
+
     fn drop_transfer(&mut self) {
         self.core.forget();
     }

@@ -183,7 +183,8 @@ def interrupted(*options: str, valid_lines: int) -> str:
     )
     assert process.stderr is not None
     valid = (line for line in process.stderr if "rad, valid" in line)
-    assert len(list(itertools.islice(valid, valid_lines))) == valid_lines
+    lines = list(itertools.islice(valid, valid_lines))
+    assert len(lines) == valid_lines and all(re.match(r"\d\d:\d\d:\d\d \w", line) for line in lines)
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 130

@@ -22,6 +22,7 @@ from drivelink.monitor.history import TruePoint
 from drivelink.monitor.view import JointView
 from drivelink.output.document import Grid, Paragraph, Rows, Section
 from drivelink.output.numbers import number, value_and_interval
+from drivelink.plaintext import stamped
 from drivelink.pubsub.client import Subscription
 from drivelink.pubsub.publisher import finite
 from drivelink.pubsub.wire import EstimateMessage
@@ -272,4 +273,4 @@ class DemoRun:
             if self._screen is not None:
                 self._screen.refresh()
             else:
-                sys.stderr.write(f"{self._view.line()}\n")
+                print(stamped(self._view.line(), sys.stderr), file=sys.stderr)

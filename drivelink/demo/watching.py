@@ -273,4 +273,4 @@ class DemoRun:
             if self._screen is not None:
                 self._screen.refresh()
             else:
-                print(stamped(self._view.line(), sys.stderr), file=sys.stderr)
+                sys.stderr.write(f"{stamped(self._view.line(), sys.stderr)}\n")

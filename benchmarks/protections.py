@@ -85,6 +85,7 @@ PROTECTIONS = [
         ("messages of others", "pubsub/feed.py", "if not (free and vouched):", "if False:", "tests/test_network_attacks.py -k 'stays or who_speaks'"),
         ("valid and impossible", "pubsub/wire.py", "if message.status & _VALID and not _usable(message):", "if False:", "tests/test_wire.py"),
         ("floods of queries", "pubsub/publisher.py", "zenoh.handlers.RingChannel(_QUERIES)", "zenoh.handlers.FifoChannel(10_000)", "tests/test_publisher.py -k flood"),
+        ("rows of a part", "fleet/table.py", "        if left < 0:", "        if False:", "tests/test_fleet_table.py -k stands_in_a_part"),
         ("a scheduler with certificates", "fleet/runner.py", 'if not address.startswith("tls://") and not insecure:', "if False:", "tests/test_fleet_run.py -k certificates"),
     )
 ]  # fmt: skip

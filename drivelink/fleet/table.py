@@ -11,6 +11,7 @@ import fcntl
 import io
 import os
 import time
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from itertools import compress, islice
 from typing import Any, NamedTuple, Self
@@ -26,6 +27,8 @@ FOLDER = "table"
 
 _PART_ROWS = 5000  # a part is full: about 2 MB, rewritten in some 0.1 s
 _MOST_ROWS = 2 * _PART_ROWS  # one that is all but full, and the rows of one recording more
+_MOST_BYTES = 64 << 20  # of the rows of a part in memory: 6 KiB for each of as many as it may have
+_AT_ONCE = 64  # rows that are unpacked before they are counted
 _FLUSH_S = 5.0  # finished work that a power loss may cost
 
 _TEXT, _REAL, _FEW, _MANY = pa.string(), pa.float64(), pa.int16(), pa.int64()
@@ -214,9 +217,9 @@ def _read(store: Store, part: str, columns: list[str] | None = None) -> Any:
         rows = sum(about.row_group(k).num_rows for k in range(about.num_row_groups))
         if not 0 <= rows <= _MOST_ROWS:
             raise FleetError(f"{where}: expected at most {_MOST_ROWS} rows, got {rows}")
-        table = pq.read_table(io.BytesIO(content), schema=wanted)
+        table = pa.Table.from_batches(_batches(content, wanted, where), wanted)
         table.validate(full=True)  # texts are UTF-8
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+    except (pa.ArrowException, OSError, KeyError, ValueError) as error:  # also of UTF-8, and twice a column
         raise FleetError(f"{where}: expected a Parquet file of drivelink: {error}") from error
     for name in _NEVER_EMPTY:
         if name in table.column_names and table[name].null_count:
@@ -224,6 +227,22 @@ def _read(store: Store, part: str, columns: list[str] | None = None) -> Any:
                 f"{where}: expected a value in each row of {name}, got {table[name].null_count} without"
             )
     return table
+
+
+def _batches(content: bytes, schema: Any, where: str) -> Iterator[Any]:
+    """Yield some rows after the other: a text may stand in the file once for thousands of them."""
+    file, left = pq.ParquetFile(pa.BufferReader(content)), _MOST_BYTES
+    present = set(file.schema_arrow.names)
+    columns = [name for name in schema.names if name in present]
+    for batch in file.iter_batches(_AT_ONCE, columns=columns, use_threads=False):
+        left -= batch.nbytes
+        if left < 0:
+            raise FleetError(f"{where}: expected rows of at most {_MOST_BYTES >> 20} MiB in memory, got more")
+        arrays = [
+            batch.column(one.name).cast(one.type) if one.name in present else pa.nulls(len(batch), one.type)
+            for one in schema
+        ]
+        yield pa.RecordBatch.from_arrays(arrays, schema=schema)
 
 
 def _bytes(table: Any) -> bytes:

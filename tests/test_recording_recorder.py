@@ -4,6 +4,7 @@ import json
 import signal
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -143,6 +144,24 @@ def test_estimates_that_were_lost_on_the_way_are_said(tmp_path, monkeypatch):
             "cycles_without_sample": 0,
             "cycles_without_estimate": 2,
         }
+
+
+def test_a_daemon_that_fell_silent_is_said(tmp_path, monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr("drivelink.recording.recorder.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr("drivelink.recording.recorder.follow_document", MagicMock())
+    joint = jointfile.load(Path(jointfile.__file__).parents[1] / "joints" / "vsa-ii.toml")
+    session: Any = MagicMock()
+    with Recorder(sink := open_sink(tmp_path / "a.mcap", joint, ""), []) as recorder:
+        recorder.taps.append(tap := ZenohTap(session, joint, sink))
+        tap._streams = [(stream := MagicMock(), lambda _: None)]
+        tap._identity = MagicMock(refused=0)
+        for after_s, silent in ((0.0, ""), (0.9, ""), (3.0, "3"), (0.5, "3"), (2.0, "5")):
+            now[0] += after_s
+            text = _Summary(tmp_path / "a.mcap", recorder).text()
+            assert text.endswith(f"nothing from the daemon for {silent} s" if silent else "in 0 s")
+            stream.try_recv.side_effect = [MagicMock(), None]
+            tap.poll()
 
 
 def test_the_line_that_was_rewritten_is_erased_before_the_result(tmp_path, monkeypatch, capsys):

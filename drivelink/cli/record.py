@@ -222,7 +222,9 @@ class _Summary:
         """Return recorded counts as text."""
         counts = [f"{n} {_PLURAL[kind]}" for kind, n in self._recorder.sink.counts.items() if n]
         lost = "".join(f", {n} cycles without {kind}" for kind, n in self._missed().items() if n)
-        refused = sum(tap.refused for tap in self._recorder.taps if isinstance(tap, ZenohTap))
+        taps = [tap for tap in self._recorder.taps if isinstance(tap, ZenohTap)]
+        silent_s, refused = sum(tap.silent_s for tap in taps), sum(tap.refused for tap in taps)
+        lost += f", nothing from the daemon for {silent_s:.0f} s" if silent_s else ""
         lost += f", {refused} messages of others ignored" if refused else ""
         lost += f", no samples: {why}" if (why := self._why()) else ""
         return f"{', '.join(counts) or 'nothing yet'} in {time.monotonic() - self._begin:.0f} s{lost}"

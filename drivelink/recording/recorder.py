@@ -74,6 +74,7 @@ class ZenohTap:
         self._motors = len(joint.motor)
         self._identity = DaemonIdentity()
         self._heard_s = -math.inf
+        self._silent_s = 0.0  # of the silences that are over
         key = f"{joint.zenoh.prefix}/{joint.name}"
         ring = zenoh.handlers.RingChannel
         handlers = {"sample": self._sample, "estimate": self._estimate, "external": self._external}
@@ -98,6 +99,15 @@ class ZenohTap:
         """Messages of other sessions, or invalid ones, which are not recorded."""
         return self._identity.refused + self._impossible
 
+    @property
+    def silent_s(self) -> float:
+        """For how long nothing came of a daemon that had been heard."""
+        return self._silent_s + self._silence(time.monotonic())
+
+    def _silence(self, now_s: float) -> float:
+        silence_s = now_s - self._heard_s
+        return silence_s if _STALE_S < silence_s < math.inf else 0.0
+
     def poll(self) -> None:
         """Store everything that has come."""
         now_s = time.monotonic()
@@ -105,6 +115,7 @@ class ZenohTap:
             while (sample := subscriber.try_recv()) is not None:
                 if not self._identity.accepts(source_of(sample), now_s - self._heard_s > _STALE_S):
                     continue
+                self._silent_s += self._silence(now_s)
                 self._heard_s = now_s
                 try:
                     take(sample)

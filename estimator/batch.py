@@ -112,8 +112,7 @@ class JointFit(NamedTuple):
     """A fitted joint.
 
     Attributes:
-        problem: the recordings without rows that contain NaN, and the joint with its orders chosen.
-        held: each recording in turn, or blocks of the only one.
+        search: the effects that may be missing.
         surplus: mean square of the errors on held-out data over that on the fitted data, see `Held.surplus`.
         fitted: the hypothesis.
         covariance: (k, k) of its parameters; includes the uncertainty whether a reading has an error at all.
@@ -121,13 +120,22 @@ class JointFit(NamedTuple):
         doubts: time stamps that may be wrong, one line each.
     """
 
-    problem: Problem
-    held: Held
+    search: Search
     surplus: float
     fitted: Fitted
     covariance: FloatArray
     absent: frozenset[Key] = frozenset()
     doubts: tuple[str, ...] = ()
+
+    @property
+    def problem(self) -> Problem:
+        """The recordings without rows that contain NaN, and the joint with its orders chosen."""
+        return self.search.problem
+
+    @property
+    def held(self) -> Held:
+        """Each recording in turn, or blocks of the only one."""
+        return self.search.held
 
     def places(self, key: Key) -> list[int]:
         """Return the columns of an everyday error: its parts, or its values in each recording."""
@@ -187,8 +195,9 @@ def fit_joint(
         _bare(model), lambda model, like: _joint_problem(usable, model, bandwidth_hz, like)
     )
     held = held_out(problem)
+    search = Search(problem, held, null=fitted)
     surplus = held.surplus(fitted)
-    free = JointFit(problem, held, surplus, fitted, _covariance(problem, fitted, surplus))
+    free = JointFit(search, surplus, fitted, _covariance(search, fitted, surplus))
     stamps = (_stamped_wrongly(free, key) for key in _optional(free))
     doubts = tuple(dict.fromkeys(one for one in stamps if one))
     return _aligned(free._replace(doubts=doubts))
@@ -246,7 +255,7 @@ def _aligned(free: JointFit) -> JointFit:
         absent = joint.absent | {max(doubtful, key=lambda key: odds[key])}
         pinned = dict.fromkeys(absent, (0.0,))
         fitted = problem.fit((), joint.fitted.base, joint.fitted.corrections, pinned=pinned)
-        covariance = _covariance(problem, fitted, joint.surplus)
+        covariance = _covariance(joint.search, fitted, joint.surplus)
         joint = joint._replace(fitted=fitted, covariance=covariance, absent=absent)
     if not joint.absent:
         return joint
@@ -262,11 +271,23 @@ def _stamped_wrongly(joint: JointFit, key: Key) -> str | None:
     return stamped_wrongly(key[0], delay, joint.problem.period_s)
 
 
-def _covariance(problem: Problem, fitted: Fitted, surplus: float) -> FloatArray:
-    """Covariance of the parameters; one held at its bound by a sign constraint keeps its prior variance."""
+def _covariance(search: Search, fitted: Fitted, surplus: float) -> FloatArray:
+    """Covariance of the parameters, with what undeclared effects change that the data support.
+
+    The springs' also has what others may contribute. One held at its bound by a sign constraint keeps its prior variance.
+    """
+    problem = search.problem
     covariance = hac_covariance(problem, fitted, surplus)
+    springs = [mine for i in range(len(problem.model.motors)) if (mine := _spring_columns(fitted, i))]
+    if springs:
+        first = [mine[0] for mine in springs]
+        effect = float(np.max(design_effects(problem, fitted, surplus)[first]))
+        unseen, instead = search.unseen(fitted, first, effect)
+        covariance = covariance + instead
+        for mine in springs:
+            covariance[np.ix_(mine, mine)] += unseen[np.ix_(mine, mine)]
     held = np.flatnonzero(fitted.posterior.bound & [s.kind in ("everyday", "base") for s in fitted.slots])
-    covariance[held, held] = fitted.regression.std[held] ** 2
+    covariance[held, held] = np.maximum(covariance[held, held], fitted.regression.std[held] ** 2)
     return covariance
 
 
@@ -314,8 +335,7 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
     problem, fitted = joint.problem, joint.fitted
     frames = problem.at(fitted.corrections, fitted.base)
     base = fitted.moved_base(problem.frames[0])
-    covariances = _spring_covariances(joint)
-    pairs = zip(base.models(frames[0]), base.alpha, covariances, strict=True)
+    pairs = zip(base.models(frames[0]), base.alpha, strict=True)
     return [_transmission_fit(joint, frames, i, *one) for i, one in enumerate(pairs)]
 
 
@@ -324,29 +344,17 @@ def _spring_columns(fitted: Fitted, motor: int) -> list[int]:
     return [j for j, s in enumerate(fitted.slots) if s.kind == "base" and s.motor == motor]
 
 
-def _spring_covariances(joint: JointFit) -> list[FloatArray]:
-    """Covariance of each transmission's parameters, with what undeclared effects may contribute."""
-    problem, fitted = joint.problem, joint.fitted
-    search, effects = Search(problem, joint.held, null=fitted), design_effects(problem, fitted, joint.surplus)
-    made = []
-    for i in range(len(problem.model.motors)):
-        mine = _spring_columns(fitted, i)
-        more = search.unseen(fitted, mine[0], float(effects[mine[0]])) if mine else 0.0
-        made.append((joint.covariance + more)[np.ix_(mine, mine)])
-    return made
-
-
 def _transmission_fit(
     joint: JointFit,
     frames: Sequence[Frame],
     i: int,
     law: TransmissionModel | None,
     alpha: FloatArray,
-    covariance: FloatArray,
 ) -> TransmissionFit:
     """The result of a fit for the i-th motor."""
     problem, fitted, motor = joint.problem, joint.fitted, joint.problem.model.motors[i]
     rows, mine = problem.group % problem.equations == i, _spring_columns(fitted, i)
+    covariance = joint.covariance[np.ix_(mine, mine)]
     left = fitted.regression.residual(fitted.posterior.x)
     spring = np.concatenate([fitted.base.torque(frame) for frame in frames])
     torque = (spring + fitted.regression.design[:, mine] @ fitted.posterior.x[mine])[rows]

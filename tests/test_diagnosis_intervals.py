@@ -97,6 +97,17 @@ def test_a_loss_while_the_link_drives_is_in_the_interval_of_a_fit():
     assert 0.05 < 1.0 - k / kit.STIFFNESS < SIGMA_95 * std / kit.STIFFNESS < 0.2
 
 
+@pytest.mark.parametrize("linked", [True, False])
+def test_an_effect_is_no_delay_of_a_reading_and_in_the_interval_of_the_damping(linked):
+    """Undeclared hysteresis is late and damps; what fits it explains the delay."""
+    (record,) = kit.World([{"hysteresis_nm": 0.6, "hysteresis_rad": 0.01}]).run()
+    found = identify(record, kit.model(linked=linked))
+    assert not found.model.link_effects
+    (motor,) = found.model.motors
+    std = motor.viscous_damping_std_nm_s_rad
+    assert std is not None and abs(motor.viscous_damping_nm_s_rad - kit.DAMPING) < SIGMA_95 * std
+
+
 def _stated(record: Record, model: JointModel) -> tuple[float, float]:
     """K and its standard deviation by `fit`."""
     (found,) = fit(record, model)

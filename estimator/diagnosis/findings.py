@@ -207,7 +207,8 @@ def transmissions_of(
             made.append(Refitted("none", {}, {}))
             continue
         alpha = np.array([after.slots[j].taken + after.posterior.x[j] for j in mine])
-        own = (covariance + search.unseen(after, mine[0], float(effects[mine[0]])))[np.ix_(mine, mine)]
+        unseen, instead = search.unseen(after, mine[:1], float(effects[mine[0]]))
+        own = (covariance + unseen + instead)[np.ix_(mine, mine)]
         own = own + _between(after, accounts, i, alpha)
         phi = problem.frames[0].motors[i].deflection
         found = middle(model, alpha, own, phi)

@@ -285,8 +285,8 @@ class Search:
         more = [t for _, t in found[tried:] if like is not None and t.candidate.family == like.family]
         return [term for _, term in found[:tried]] + more
 
-    def unseen(self, parent: Fitted, place: int, effect: float) -> FloatArray:
-        """Increase of a hypothesis' covariance by effects that it does not contain, at their prior size.
+    def unseen(self, parent: Fitted, places: Sequence[int], effect: float) -> tuple[FloatArray, FloatArray]:
+        """Increase of a hypothesis' covariance by effects that it lacks: at their prior size, and as found.
 
         A rejected effect may still be present if the motion does not separate it: a gear with losses that is
         always driven in one direction looks like a softer spring. It adds the covariance of the larger model
@@ -298,16 +298,17 @@ class Search:
 
         Args:
             parent: the hypothesis.
-            place: of the parameter in question.
+            places: of the parameters in question.
             effect: design effect of the rows (`design_effects`).
 
         Returns:
-            (k, k), each effect at its most promising shape. Excluded are, unless the data support them,
-            effects that change the transmission's curve, which are another model, and, in a fit, those of the
-            drive; its constant scale is the anchor.
+            (k, k) each, every effect at its most promising shape. Excluded from the first are effects that
+            change the transmission's curve, which are another model, and, in a fit, those of the drive; its
+            constant scale is the anchor.
         """
         families: dict[tuple[object, ...], FloatArray] = {}
         nothing = np.zeros_like(parent.posterior.covariance)
+        precise = 1.0 / np.maximum(np.diag(parent.posterior.covariance)[places], 1e-300)
         supported = []
         for one in self._library_beside(parent):
             candidate = one.candidate
@@ -320,12 +321,12 @@ class Search:
             more = nothing if candidate.bends or drive else best.covariance
             _, *family = candidate.family  # either side of the motor's balance is the same to it
             before = families.get(tuple(family), nothing)
-            families[tuple(family)] = max(more, before, key=lambda x: float(x[place, place]))
+            families[tuple(family)] = max(more, before, key=lambda x: float(np.diag(x)[places] @ precise))
         models = [parent, *supported]
         best_of = max(models, key=lambda h: float(np.mean(self.held.scores(h))))
         apart = [np.outer(x, x) for x in (_change(parent, one) for one in models)]
         between = np.tensordot(self.held.weights(models, best_of), apart, axes=1)
-        return np.asarray(sum(families.values(), between))
+        return np.asarray(sum(families.values(), nothing)), between
 
     def _library_beside(self, parent: Fitted) -> Iterator[_Tried]:
         """All additional effects, linearised, each at the most promising point of its grid."""

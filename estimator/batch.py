@@ -274,7 +274,8 @@ def _stamped_wrongly(joint: JointFit, key: Key) -> str | None:
 def _covariance(search: Search, fitted: Fitted, surplus: float) -> FloatArray:
     """Covariance of the parameters, with what undeclared effects change that the data support.
 
-    The springs' also has what others may contribute. One held at its bound by a sign constraint keeps its prior variance.
+    The springs' also has what others may contribute. One held at its bound by a sign constraint keeps its
+    prior variance.
     """
     problem = search.problem
     covariance = hac_covariance(problem, fitted, surplus)

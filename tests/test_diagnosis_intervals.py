@@ -108,6 +108,16 @@ def test_an_effect_is_no_delay_of_a_reading_and_in_the_interval_of_the_damping(l
     assert std is not None and abs(motor.viscous_damping_nm_s_rad - kit.DAMPING) < SIGMA_95 * std
 
 
+def test_no_shape_is_stated_that_the_law_does_not_have():
+    """A constant spring declared as a VSA-II's: no joint file holds the shape that fits it."""
+    (record,) = kit.World([{"hysteresis_nm": 0.6, "hysteresis_rad": 0.01}]).run()
+    (motor,) = kit.model().motors
+    vsa = replace(motor, transmission=replace(motor.transmission, model="vsa-ii"))
+    found = diagnose(record, replace(kit.model(), motors=(vsa,)))
+    assert not found.transmissions[0].parameters
+    assert any("leaves the range that the law has" in note for note in found.notes)
+
+
 def _stated(record: Record, model: JointModel) -> tuple[float, float]:
     """K and its standard deviation by `fit`."""
     (found,) = fit(record, model)

@@ -213,10 +213,14 @@ def transmissions_of(
         phi = problem.frames[0].motors[i].deflection
         found = middle(model, alpha, own, phi)
         more = left[i] > float(np.std(problem.frames[0].project(model.torque(phi, alpha))))
-        if more or not found.determined or any(after.posterior.bound[mine]):
+        shape = alpha[len(alpha) - len(model.shape_bounds) :]
+        ends = any(not low < x < high for x, (low, high) in zip(shape, model.shape_bounds, strict=True))
+        if more or ends or not found.determined or any(after.posterior.bound[mine]):
             value = f"{found.stiffness_nm_rad:.4g} ± {SIGMA_95 * found.std_nm_rad:.2g} N·m/rad (95 %)"
             if any(after.posterior.bound[mine]):
                 value = "no positive one fits better than none"
+            elif ends:
+                value = "its shape leaves the range that the law has"
             elif more:
                 value = "the balance leaves more torque than the spring carries"
             doubts.append(f"these data do not determine the stiffness of motor {i + 1}: {value}")

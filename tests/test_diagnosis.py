@@ -285,6 +285,7 @@ def test_the_simplest_within_one_standard_error_is_chosen(gain, best, chosen, mo
     third.families, third.scores = simple.families, simple.scores + 0.5
     simple.regression = other.regression = third.regression = SimpleNamespace(floor=3.0)
     assert held.simplest([simple, third]) is simple
+    assert held.weights([simple, third], simple, naming=False)[1] > 0.9  # for an interval what is left counts
     other.families, other.parameters, other.scores = simple.families, simple.parameters, simple.scores + 0.5
     third.scores, third.log_prior = other.scores + np.resize([0.1, -0.12], 10), lambda *_: -8.0
     assert held.simplest([simple, other, third]) is third

@@ -209,22 +209,25 @@ class Held:
         """Whether a model of at most as many effects is confirmed over one."""
         return any(len(one.terms) <= len(found.terms) and self.confirms(one, found) for one in models)
 
-    def weights(self, models: Sequence[Fitted], found: Fitted) -> FloatArray:
+    def weights(self, models: Sequence[Fitted], found: Fitted, *, naming: bool = True) -> FloatArray:
         """Return (m,) probability of each model: its prior times its stacking weight.
 
         The weight is the mean over Bayesian bootstraps of the blocks (pseudo-BMA+ of Yao, Vehtari, Simpson
-        and Gelman, Bayesian Analysis 13, 2018). A difference to the one found that is not confirmed is none.
-        A richer law that the data prefer and that laws' errors hide is as likely as the one found.
+        and Gelman, Bayesian Analysis 13, 2018). Of names, a difference to the one found that is not
+        confirmed is none, and a richer law that the data prefer and that laws' errors hide is as likely.
         """
         errors = self._independent(found)
         gain = np.array([self.scores(one, models) - self.scores(found, models) for one in models])
         shares = np.random.default_rng(0).dirichlet(np.ones(gain.shape[1]), whole("bootstraps"))
-        least = np.array([-np.inf if self.confirms(found, one) else 0.0 for one in models])
-        most = np.array([np.inf if self.confirms(one, found) else 0.0 for one in models])
+        odds = errors * (shares @ gain.T)
         prior = np.array([one.log_prior(errors, self.price) for one in models])
-        as_likely = np.array(self._preferred(found, models))
-        prior = np.where(as_likely, np.maximum(prior, found.log_prior(errors, self.price)), prior)
-        odds = np.clip(errors * (shares @ gain.T), least, most) + prior
+        if naming:
+            least = np.array([-np.inf if self.confirms(found, one) else 0.0 for one in models])
+            most = np.array([np.inf if self.confirms(one, found) else 0.0 for one in models])
+            odds = np.clip(odds, least, most)
+            as_likely = np.array(self._preferred(found, models))
+            prior = np.where(as_likely, np.maximum(prior, found.log_prior(errors, self.price)), prior)
+        odds = odds + prior
         for pair in self._twins(models):
             sizes = [models[k].log_size(name) for k, name in zip(pair, _TWINS, strict=True)]
             odds[:, pair] = np.max(odds[:, pair], axis=1, keepdims=True) + sizes - max(sizes)

@@ -317,15 +317,15 @@ class Search:
             if drive and (candidate.kind.name == "torque_constant" or best.gain <= 0.0):
                 continue
             if best.gain > 0.0:
-                supported.append(self._grown(parent, Term(candidate, dict(one.values))))
+                supported.append((best.gain, Term(candidate, dict(one.values))))
             more = nothing if candidate.bends or drive else best.covariance
             _, *family = candidate.family  # either side of the motor's balance is the same to it
             before = families.get(tuple(family), nothing)
             families[tuple(family)] = max(more, before, key=lambda x: float(np.diag(x)[places] @ precise))
-        models = [parent, *supported]
-        best_of = max(models, key=lambda h: float(np.mean(self.held.scores(h))))
+        supported.sort(key=lambda pair: -pair[0])
+        models = [parent, *(self._grown(parent, term) for _, term in supported[: whole("tried")])]
         apart = [np.outer(x, x) for x in (_change(parent, one) for one in models)]
-        between = np.tensordot(self.held.weights(models, best_of), apart, axes=1)
+        between = np.tensordot(self.held.weights(models, parent, naming=False), apart, axes=1)
         return np.asarray(sum(families.values(), nothing)), between
 
     def _library_beside(self, parent: Fitted) -> Iterator[_Tried]:

@@ -161,3 +161,25 @@ def test_a_spring_behind_an_uneven_gear_is_deflected_by_its_error_too():
     assert np.std(lost) < 0.01 * np.std(motion.torque_nm)  # the motion's harmonics behind the light filter
     off = (estimates.stiffness_nm_rad / motion.stiffness_nm_rad - 1.0)[late]
     assert np.sqrt(np.mean(off**2)) < 0.002
+
+
+@pytest.mark.parametrize(
+    "name, parameters",
+    [
+        ("asymmetric_friction", {"positive_nm": 1.6e-3, "negative_nm": 0.8e-3}),
+        ("load_dependent_friction", {"coefficient": 0.1}),
+        ("back_driving_loss", {"coefficient": 0.15}),
+    ],
+)
+def test_declared_friction_leaves_the_spring_what_it_is(name, parameters):
+    """Formed of a sample before and believed while its sign changed, it made the stiffness 1 % and the torque 3 % off."""
+    motion = kit.motion("constant", 16.0, seed=1, effects=[make(name, parameters, 0)])
+    joint = kit.declared("constant")
+    known = Effect(name=name, parameters=parameters)
+    joint = replace(joint, motors=(replace(joint.motors[0], effects=(known,)),))
+    estimates, _ = kit.play(joint, motion.samples)
+    late = slice(6000, None)
+    assert np.all(estimates.valid[late]) and not np.any(estimates.status & int(Status.CHANGED))
+    off = (estimates.stiffness_nm_rad / motion.stiffness_nm_rad - 1.0)[late]
+    assert np.sqrt(np.mean(off**2)) < 1e-3
+    assert np.std((estimates.torque_nm - motion.torque_nm)[late]) < 1e-3 * np.std(motion.torque_nm)

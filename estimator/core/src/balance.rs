@@ -237,18 +237,14 @@ impl Balance {
         factors
     }
 
-    /// One period.
-    pub fn feed(
-        &mut self,
-        filters: &Filters,
-        theta: f64,
-        phi: f64,
-        torque: f64,
-        link: &Channel,
-        declared: &Declared,
-    ) {
+    /// One period of what is read.
+    pub fn read(&mut self, filters: &Filters, theta: f64, torque: f64) {
         self.position.smooth(filters, theta);
         self.torque.held(filters, torque);
+    }
+
+    /// The same period of what is formed of it.
+    pub fn feed(&mut self, filters: &Filters, phi: f64, link: &Channel, declared: &Declared) {
         self.effects.pass(filters, declared.formed);
         self.elastic.smooth(filters, declared.elastic);
         if self.size.deflection == 0.0 {
@@ -267,7 +263,7 @@ impl Balance {
         let sign = (rate / speed).tanh();
         let resting = 1.0 - sign * sign;
         self.resting[0].pass(filters, resting);
-        self.resting[1].pass(filters, resting * declared.at_rest);
+        self.resting[1].pass(filters, (resting * declared.at_rest).max(declared.changing));
         let step = (phi - self.last) / self.size.range.max(f64::MIN_POSITIVE);
         self.last = phi;
         for (stop, width) in self.stops.iter_mut().zip(STOP_WIDTHS) {

@@ -57,6 +57,8 @@ pub struct Declared {
     pub transmission: f64,
     /// Dry friction of the motor that is open at rest.
     pub at_rest: f64,
+    /// What of it is open while its sign changes.
+    pub changing: f64,
 }
 
 /// The effects of one motor and its transmission.
@@ -113,12 +115,14 @@ impl MotorEffects {
     /// What they do at a moment, from filtered signals, and the elastic ones at φ as it is read.
     pub fn balance(&mut self, c: &Coordinates, phi: f64, period_s: f64) -> Declared {
         let (motor, transmission) = (self.motor.torque(c, period_s), self.transmission.torque(c, period_s));
-        let friction = self.motor.elements.iter().filter(|_| c.sane());
+        let friction = self.motor.elements.iter().filter(|_| c.sane()).map(|(element, _)| element.at_rest(c));
+        let [at_rest, changing] = friction.fold([0.0; 2], |sum, one| [sum[0] + one[0], sum[1] + one[1]]);
         Declared {
             formed: motor - transmission + self.spring(c.deflection).0,
             elastic: self.spring(phi).0,
             transmission,
-            at_rest: friction.map(|(element, _)| element.at_rest(c)).sum(),
+            at_rest,
+            changing,
         }
     }
 

@@ -300,13 +300,16 @@ impl Element {
         if self.kind.terms() == 2 { weighted + self.values[1] * terms[1] } else { weighted }
     }
 
-    /// Dry friction of a motor, N·m, that may hold it at rest under this load by anything up to this; 0 of what has none.
+    /// Dry friction of a motor, N·m, that may hold it at rest under this load by anything up to this, and how much of that
+    /// is open as its sign changes at this velocity; 0 of what has none.
     #[must_use]
-    pub fn at_rest(&self, c: &Coordinates) -> f64 {
-        let Some(place) = table::smoothing(self.kind) else { return 0.0 };
+    pub fn at_rest(&self, c: &Coordinates) -> [f64; 2] {
+        let Some(place) = table::smoothing(self.kind) else { return [0.0; 2] };
         let sliding = 3.0 * self.values[place]; // tanh 3 is 0.995: its sign has changed
         let at = |velocity| self.torque(&Coordinates { velocity, ..*c }).abs();
-        at(sliding).max(at(-sliding))
+        let (full, along) = (at(sliding).max(at(-sliding)), at(sliding.copysign(c.velocity)));
+        let slid = if along > 0.0 { (at(c.velocity) / along).min(1.0) } else { 1.0 };
+        [full, full * (1.0 - slid * slid)]
     }
 
     /// (x, ∂x/∂φ) where x depends on the deflection alone, so that the element is a part of the spring.

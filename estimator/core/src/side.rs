@@ -235,8 +235,9 @@ impl Side {
             self.judge();
         }
         self.theta = theta;
+        self.balance.read(filters, theta, torque);
         self.feed_effects(phi, link, time);
-        self.balance.feed(filters, theta, phi, torque, link, &self.declared);
+        self.balance.feed(filters, phi, link, &self.declared);
         self.followed_s -= self.period;
         self.held_s += self.period;
         if !self.rigid {

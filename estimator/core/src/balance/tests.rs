@@ -28,7 +28,8 @@ fn the_row_of_a_known_joint_is_a_balance() {
         }
         link.smooth(&filters, q);
         // The mean over a period is what a held torque of this value amounts to.
-        balance.feed(&filters, theta, q - theta, torque(t + 0.5 * T), &link, &Declared::default());
+        balance.read(&filters, theta, torque(t + 0.5 * T));
+        balance.feed(&filters, q - theta, &link, &Declared::default());
         balance.observe(q - theta, true);
         if k > 2000 {
             let (row, size) = (balance.row(), balance.size.deflection);
@@ -50,7 +51,8 @@ fn moved(balance: &mut Balance, from: u32, to: u32, amplitude: f64) -> Row {
         let q = amplitude * (f64::from(k) * 3e-3).sin();
         link.smooth(&filters, q);
         if k >= from {
-            balance.feed(&filters, 0.0, q, 0.0, &link, &Declared::default());
+            balance.read(&filters, 0.0, 0.0);
+            balance.feed(&filters, q, &link, &Declared::default());
             balance.observe(q, true);
         }
     }

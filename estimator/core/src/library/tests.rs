@@ -115,8 +115,12 @@ fn only_dry_friction_holds_a_motor_at_rest() {
         ("viscous_damping", vec![0.5], 0.0),
         ("load_dependent_friction", vec![0.2, 0.01], 1.0),
     ] {
-        let found = Element::new(name, &values).unwrap().at_rest(&loaded);
+        let element = Element::new(name, &values).unwrap();
+        let [found, changing] = element.at_rest(&loaded);
         assert!((found - most).abs() <= 0.01 * most, "{name}: {found}"); // tanh 3 is 0.995
+        assert!(changing < 0.02 * most + f64::MIN_POSITIVE, "{name}: {changing}"); // it slides
+        let [_, changing] = element.at_rest(&Coordinates { velocity: 0.0, ..loaded });
+        assert_eq!(changing, found, "{name}");
     }
 }
 

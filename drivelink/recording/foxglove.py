@@ -144,9 +144,10 @@ class FoxgloveSink(MessageSink):
         self.counts = dict.fromkeys(sorted(self.wants), 0)
         self.set_up(joint)
         context = self._context = foxglove.Context()  # channels close with it
+        listener: Any = self  # has what a server without further capabilities calls of a ServerListener
         try:
             self._server: Any = foxglove.start_server(
-                name="drivelink", host="127.0.0.1", port=port, context=context, server_listener=self
+                name="drivelink", host="127.0.0.1", port=port, context=context, server_listener=listener
             )
         except (OSError, RuntimeError) as error:
             raise UsageError(f"--port {port}: cannot be served: {error}") from error

@@ -131,6 +131,26 @@ def test_a_drive_that_counts_from_elsewhere_after_a_reboot_is_not_believed_befor
     assert np.all(np.abs(torque - motion.torque_nm)[valid] < 0.25 * np.sqrt(np.mean(motion.torque_nm**2)))
 
 
+@pytest.mark.parametrize(
+    "name", ["quadratic", *(pytest.param(name, marks=SLOW) for name in ("vsa-ii", "constant"))]
+)
+def test_a_spring_that_is_another_one_after_a_reboot_is_learned_anew(name):
+    """What was known of it before was believed to a ten-thousandth: the joint was never valid again, or wrong."""
+    motion, estimates = kit.motion(name, 30.0, seed=1, step=(8.0, 1.2)), []
+    estimator = kit.make_estimator(kit.declared(name), kit.EstimatorSettings(), kit.PERIOD_S)
+    for k, sample in enumerate(motion.samples):
+        if k == 8000:
+            estimator.lose_zeros()
+        one = estimator.step(sample)
+        estimates.append((one.status & 1, one.stiffness_nm_rad, one.stiffness_std_nm_rad))
+    valid, stiffness, std = np.array(estimates).T
+    valid = valid > 0
+    assert valid[7000:8000].all() and valid[-5000:].all()
+    off = np.abs(stiffness - motion.stiffness_nm_rad)[valid]
+    assert np.all(off < np.maximum(0.1 * motion.stiffness_nm_rad, 3.0 * std)[valid])
+    assert np.all(off[-5000:] < 0.01 * motion.stiffness_nm_rad[-5000:])
+
+
 @pytest.mark.parametrize("first", [0.0, 1.8])
 def test_a_reboot_after_another_loses_one_motors_zero_and_nothing_that_was_found_since_the_first(first):
     """Also where the first one was needed: what was read then is no measure of where the law is to hold."""

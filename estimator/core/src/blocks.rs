@@ -17,7 +17,7 @@ use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection};
 use crate::student::f_quantile;
-use crate::unknowns::{ACTIVE, Spring};
+use crate::unknowns::{ACTIVE, OFFSET, Spring, ZERO};
 
 /// What a block did.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,6 +42,25 @@ struct Carried {
     set: Set,
     deflection: f64, // the largest, until then
     unexplained: f64,
+}
+
+impl Carried {
+    /// The others are open.
+    fn keep(&mut self, kept: Set) {
+        let covariance = inverse(&self.precision, self.set);
+        self.set &= kept;
+        self.precision = inverse(&covariance, self.set);
+    }
+
+    /// It is forgotten as blocks are, but for what tells where the zero is: encoders do not drift.
+    fn fade(&mut self) {
+        let keeps = |unknown: usize| {
+            if matches!(unknown, OFFSET | ZERO) { 1.0 } else { (1.0 - 1.0 / BLOCKS as f64).sqrt() }
+        };
+        for (i, row) in self.precision.iter_mut().enumerate() {
+            row.iter_mut().enumerate().for_each(|(j, value)| *value *= keeps(i) * keeps(j));
+        }
+    }
 }
 
 /// How noisy readings are.
@@ -93,8 +112,9 @@ pub struct Blocks {
     suspected: bool, // the zero, of being elsewhere since a restart
     skipped: u32,    // rows that are still of what was before
     settle: u32,
-    fitted: bool, // what the file knows has been held against a block
-    lost: bool,   // the zero: it may be anywhere, but for what motion shows
+    fitted: bool,  // what the file knows has been held against a block
+    lost: bool,    // the zero: it may be anywhere, but for what motion shows
+    missed: usize, // times that what was known before has located it wrongly
     frame: Option<Frame>,
     #[serde(with = "crate::snapshot::array")]
     residual: Row,
@@ -165,6 +185,7 @@ impl Blocks {
             settle,
             fitted: false,
             lost: false,
+            missed: 0,
             frame: None,
             residual: [0.0; crate::gram::COLUMNS],
             odds: None,
@@ -184,7 +205,7 @@ impl Blocks {
     pub fn clear(&mut self) {
         self.spring.reset();
         self.forget_rows();
-        (self.carried, self.lost) = (None, false);
+        (self.carried, self.lost, self.missed) = (None, false, 0);
     }
 
     /// Forget rows and what they have taught: they are of other moments. A lost zero stays lost.
@@ -292,7 +313,7 @@ impl Blocks {
         self.end_doubt();
         self.solve();
         if self.lost && self.located && self.off == 0.0 && !self.is_explained() {
-            self.lose_zero(); // it was located wrongly
+            self.miss_zero();
         }
         Closed::Added
     }
@@ -323,6 +344,7 @@ impl Blocks {
 
     fn push(&mut self, block: Gram) {
         let peak = std::mem::take(&mut self.peak);
+        self.carried.iter_mut().for_each(Carried::fade);
         if self.ring.len() < BLOCKS {
             self.ring.push(block);
             self.peaks.push(peak);

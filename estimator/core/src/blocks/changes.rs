@@ -4,10 +4,10 @@ use super::solve::ZEROS;
 use super::{Blocks, Carried, Closed};
 use crate::balance;
 use crate::causes::{Cause, Known, Noise, Odds, TABLE};
-use crate::choices::{BLOCKS, CONVINCING, EVEN, FEWEST, REST, UNUSUAL};
+use crate::choices::{BLOCKS, CONVINCING, DRIFTED, EVEN, FEWEST, REST, UNUSUAL};
 use crate::gram::{Gram, Set, UNKNOWNS, inverse, set};
 use crate::spring::TERMS;
-use crate::unknowns::{ASYMMETRY, CORNER, DAMPING, INERTIA, SPRING, ZERO};
+use crate::unknowns::{ASYMMETRY, CORNER, DAMPING, INERTIA, OFFSET, SPRING, ZERO};
 
 impl Blocks {
     /// Something has changed: rows are of use again when the filters have forgotten what was before.
@@ -121,7 +121,7 @@ impl Blocks {
             return Closed::Begun;
         }
         if self.lost && self.doubted >= FEWEST {
-            self.lose_zero(); // it was located wrongly
+            self.miss_zero();
             return Closed::Unexplained;
         }
         if self.doubted >= BLOCKS {
@@ -162,9 +162,11 @@ impl Blocks {
             x[unknown] = self.spring.alpha[i];
         }
         x[ZERO] = self.spring.zero;
+        let mut covariance = posterior.covariance;
+        SPRING.for_each(|i| covariance[i][i] += (DRIFTED * x[i]).powi(2));
         self.carried = Some(Carried {
             x,
-            precision: inverse(&posterior.covariance, kept),
+            precision: inverse(&covariance, kept),
             set: kept,
             deflection: self.deflection,
             unexplained: self.usual_unexplained().min(self.unexplained),
@@ -177,17 +179,32 @@ impl Blocks {
         self.suspected = true;
     }
 
+    /// The zero was located wrongly. Where that happens again, the joint is not what was known of it before: all but its
+    /// motor's inertia and the torque's zero is learned anew.
+    pub(super) fn miss_zero(&mut self) {
+        self.missed += 1;
+        if self.missed >= CONVINCING {
+            self.spring.reset();
+            (self.posterior, self.missed) = (None, 0);
+            self.carried.iter_mut().for_each(|carried| carried.keep(1 << INERTIA | 1 << OFFSET));
+        }
+        self.lose_zero();
+    }
+
     /// Where the zero between the encoders is, is not known any more.
     pub fn lose_zero(&mut self) {
         let found = self.located && !self.doubting && !self.is_unconfirmed() && self.is_explained();
         if self.are_few() && self.carried.is_none() {
             self.spring.reset(); // a few blocks have taught nothing: their zero may have been another one, too
-        } else if let Some(carried) = self.carried.as_ref().filter(|_| self.lost && !found) {
+        } else if let Some(carried) =
+            self.carried.as_ref().filter(|one| self.lost && !found && one.set & set(SPRING) != 0)
+        {
             // What was learned without a zero may be of another one: as it was before.
             self.spring.alpha[..TERMS].copy_from_slice(&carried.x[SPRING]);
         } else {
             self.carry_over(1 << ZERO | set(CORNER.start..ASYMMETRY.end));
         }
+        self.missed = if found { 0 } else { self.missed };
         let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
         self.forget_rows();
         (self.carried, self.lost, self.posterior, self.located) = (carried, true, None, false);

@@ -17,7 +17,7 @@ use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection};
 use crate::student::f_quantile;
-use crate::unknowns::{ACTIVE, OFFSET, Spring, ZERO};
+use crate::unknowns::{ACTIVE, Spring};
 
 /// What a block did.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -50,16 +50,6 @@ impl Carried {
         let covariance = inverse(&self.precision, self.set);
         self.set &= kept;
         self.precision = inverse(&covariance, self.set);
-    }
-
-    /// It is forgotten as blocks are, but for what tells where the zero is: encoders do not drift.
-    fn fade(&mut self) {
-        let keeps = |unknown: usize| {
-            if matches!(unknown, OFFSET | ZERO) { 1.0 } else { (1.0 - 1.0 / BLOCKS as f64).sqrt() }
-        };
-        for (i, row) in self.precision.iter_mut().enumerate() {
-            row.iter_mut().enumerate().for_each(|(j, value)| *value *= keeps(i) * keeps(j));
-        }
     }
 }
 
@@ -344,7 +334,6 @@ impl Blocks {
 
     fn push(&mut self, block: Gram) {
         let peak = std::mem::take(&mut self.peak);
-        self.carried.iter_mut().for_each(Carried::fade);
         if self.ring.len() < BLOCKS {
             self.ring.push(block);
             self.peaks.push(peak);

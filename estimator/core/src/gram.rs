@@ -11,7 +11,7 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use cholesky::Cholesky;
+pub(crate) use cholesky::Cholesky;
 pub use frame::{Frame, Reduced};
 
 /// Columns of a row.

@@ -7,7 +7,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::choices::{MARGIN, REACHED};
-use crate::gram::{UNKNOWNS, inverse, set};
+use crate::gram::{Cholesky, UNKNOWNS, set};
 use crate::laws::Law;
 
 /// Functions of a family.
@@ -142,10 +142,14 @@ impl Projection {
             }
         }
         (1..=N).for_each(|i| normal[i][i] *= 1.0 + RIDGE);
-        let inverse = inverse(&normal, set(1..N + 1));
-        let weights = std::array::from_fn(|i| {
-            rows.map(|row| row.iter().zip(&inverse[1 + i][1..]).map(|(b, c)| b * c).sum())
-        });
+        let factors = Cholesky::new(set(1..N + 1), &normal);
+        let mut weights = [[0.0; NODES]; N];
+        for (k, row) in rows.iter().enumerate() {
+            let mut right = [0.0; UNKNOWNS];
+            right[1..=N].copy_from_slice(row);
+            let solved = factors.solve(&right);
+            weights.iter_mut().zip(&solved[1..]).for_each(|(weights, value)| weights[k] = *value);
+        }
         Projection { nodes, weights }
     }
 

@@ -3,7 +3,7 @@
 use super::{Matrix, PIVOT, Set, UNKNOWNS, Vector, product, unknowns};
 
 /// A positive definite matrix of some unknowns as Uᵀ U, scaled by its diagonal.
-pub(super) struct Cholesky {
+pub(crate) struct Cholesky {
     index: [usize; UNKNOWNS],
     n: usize,
     scale: Vector, // 1/√ of the diagonal
@@ -12,7 +12,7 @@ pub(super) struct Cholesky {
 }
 
 impl Cholesky {
-    pub(super) fn new(set: Set, matrix: &Matrix) -> Cholesky {
+    pub(crate) fn new(set: Set, matrix: &Matrix) -> Cholesky {
         let mut made = Cholesky {
             index: [0; UNKNOWNS],
             n: 0,
@@ -88,6 +88,11 @@ impl Cholesky {
             out[self.index[i]] = scaled[i] * self.scale[i];
         }
         out
+    }
+
+    /// The solution for one right side, by unknowns.
+    pub(crate) fn solve(&self, b: &Vector) -> Vector {
+        self.unwhiten(&self.whiten(b))
     }
 
     /// The inverse, by unknowns.

@@ -67,10 +67,12 @@ def diagnose(
         return judge, judge.diagnosis()
 
     judge, outcome = judged(made(model))
+    tried = [_orders(judge.problem.model)]
     while bends(model, outcome.effects):
         problem = ordered_beside(model, made, hold, judge.found)
-        if _orders(problem.model) == _orders(judge.problem.model):
+        if _orders(problem.model) in tried:
             break
+        tried.append(_orders(problem.model))
         other, raised = judged(problem)
         if judge.held.confirms(judge.found, other.found, other.held):
             break

@@ -138,9 +138,8 @@ impl Blocks {
         settle: u32,
         alarms_per_hour: f64,
     ) -> Blocks {
-        let rows = (BLOCK_S / period_s).round().max(8.0);
+        let (rows, spring) = ((BLOCK_S / period_s).round().max(8.0), Spring::new(motor));
         let errors = (rows / correlated).max(1.0); // independent ones in a block
-        let spring = Spring::new(motor);
         Blocks {
             motor: motor.clone(),
             priors: *priors,
@@ -319,8 +318,7 @@ impl Blocks {
         self.own = self.noise.variance.sqrt();
         self.residual = frame.residual(&prior.mean, known);
         self.torque = self.spring.torque_rms(&projection, block, self.lost);
-        self.posterior =
-            Some(Posterior { set: known, x: prior.mean, covariance, log_evidence: 0.0, square: 0.0 });
+        self.posterior = Some(Posterior::believed(known, prior.mean, covariance));
         (self.frame, self.fitted) = (Some(frame), true);
     }
 

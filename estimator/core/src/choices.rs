@@ -72,7 +72,7 @@ choices! {
     USEFUL: f64 = 0.2, "torque", "left at most by a curve that is used", "a spring carries most of what it explains";
     MOTION: f64 = 0.35, "", "standard deviation of ln(residual²) between two motions", "errors depend on the motion";
     DRIFT: f64 = 1e-4, "1/s", "growth of a stiffness' relative deviation without motion", "temperatures change in minutes";
-    DRIFTED: f64 = 0.02, "", "of that at most, and what is believed of a spring after a restart", "a joint does not change more by standing";
+    DRIFTED: f64 = 0.02, "", "of that at most, and of a spring that is carried over", "a joint does not change more by standing";
     // Doubt.
     EVEN: f64 = 0.05, "probability", "below which another explanation does not count", "one in twenty";
     ACCUSED: f64 = 1000.0, "", "odds at which what is declared is called wrong", "one in 1000";

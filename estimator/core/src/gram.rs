@@ -187,6 +187,12 @@ pub struct Posterior {
 }
 
 impl Posterior {
+    /// What is believed before any rows.
+    #[must_use]
+    pub fn believed(set: Set, x: Vector, covariance: Matrix) -> Posterior {
+        Posterior { set, x, covariance, log_evidence: 0.0, square: 0.0 }
+    }
+
     /// gᵀ C g.
     #[must_use]
     pub fn variance_along(&self, g: &Vector) -> f64 {

@@ -230,7 +230,7 @@ impl Spring {
     pub fn declared_posterior(&self) -> Option<Posterior> {
         let covariance = self.covariance.filter(|_| self.anchored)?;
         let known = set(SPRING.start..SPRING.start + self.least);
-        Some(Posterior { set: known, x: [0.0; UNKNOWNS], covariance, log_evidence: 0.0, square: 0.0 })
+        Some(Posterior::believed(known, [0.0; UNKNOWNS], covariance))
     }
 
     /// α that the deviations are counted from.

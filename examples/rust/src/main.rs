@@ -7,17 +7,23 @@ use drivelink_wire::Estimate;
 use zenoh::handlers::RingChannel;
 use zenoh::{Config, Wait};
 
-fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+type Failure = Box<dyn std::error::Error + Send + Sync>;
+
+fn session(endpoint: &str) -> Result<zenoh::Session, Failure> {
+    let mut config = Config::default();
+    config.insert_json5("mode", "\"client\"")?;
+    config.insert_json5("connect/endpoints", &format!("[\"{endpoint}\"]"))?;
+    config.insert_json5("scouting/multicast/enabled", "false")?;
+    zenoh::open(config).wait()
+}
+
+fn main() -> Result<(), Failure> {
     let mut arguments = std::env::args().skip(1);
     let joint = arguments.next().unwrap_or("elbow".into());
     let endpoint = arguments.next().unwrap_or("tcp/127.0.0.1:7447".into());
     let count: usize = arguments.next().map_or(Ok(usize::MAX), |n| n.parse())?;
 
-    let mut config = Config::default();
-    config.insert_json5("mode", "\"client\"")?;
-    config.insert_json5("connect/endpoints", &format!("[\"{endpoint}\"]"))?;
-    config.insert_json5("scouting/multicast/enabled", "false")?;
-    let session = zenoh::open(config).wait()?;
+    let session = session(&endpoint)?;
     let subscriber = session
         .declare_subscriber(format!("drivelink/{joint}/estimate"))
         .with(RingChannel::new(1024))

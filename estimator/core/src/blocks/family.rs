@@ -169,8 +169,7 @@ mod tests {
         blocks.grow(&[1.0; COLUMNS], &balance);
         blocks.seen = [-0.7, 0.9];
         let covariance = [[0.0; UNKNOWNS]; UNKNOWNS];
-        blocks.posterior =
-            Some(Posterior { set: 0, x: [0.0; UNKNOWNS], covariance, log_evidence: 0.0, square: 0.0 });
+        blocks.posterior = Some(Posterior::believed(0, [0.0; UNKNOWNS], covariance));
         blocks.fit_projection();
         blocks.restate();
         let row = |size: f64| {

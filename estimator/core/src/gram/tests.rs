@@ -203,7 +203,7 @@ fn a_variance_below_zero_is_no_certainty() {
     let mut covariance = [[0.0; UNKNOWNS]; UNKNOWNS];
     (covariance[1][1], covariance[2][2]) = (1.0, 1.0);
     (covariance[1][2], covariance[2][1]) = (-1.1, -1.1);
-    let known = Posterior { set: set(1..3), x: [0.0; UNKNOWNS], covariance, log_evidence: 0.0, square: 0.0 };
+    let known = Posterior::believed(set(1..3), [0.0; UNKNOWNS], covariance);
     let along = |first: f64, second: f64| {
         let mut g = [0.0; UNKNOWNS];
         (g[1], g[2]) = (first, second);

@@ -127,6 +127,16 @@ def test_a_unit_that_changes_in_the_run_has_the_node_configured_anew():
             assert scales(made, 1)[Signal.MOTOR_TORQUE] == pytest.approx(factor * before)
 
 
+def test_from_the_frame_on_that_writes_a_unit_nothing_is_valid_until_it_has_been_read():
+    with rig() as made:
+        assert made.run(1000)[-1].status & Status.VALID
+        other = Listener(made.joint)
+        other.send(0x602, bytes.fromhex("2f7e6000c0000000"))  # polarity: positions change their sign
+        assert not any(e.status & Status.VALID for e in made.run(100))
+        other.close()
+        assert made.events[0] == "node 2: somebody else writes its units: it is configured again"
+
+
 def test_a_frame_that_carries_another_object_than_is_mapped_is_contradicted_until_it_does():
     with rig(vsa(bus=OFTEN)) as made:
         made.run(ROUND)

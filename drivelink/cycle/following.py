@@ -89,9 +89,15 @@ class MapFollower:
             self._known.feed(cob_id, data, now_s)
             if self._check is not None:
                 self._check.request(cob_id - 0x600, data, now_s)
-            address, assembler = written_object(data), self._assemblers.get(cob_id - 0x600)
-            if address is not None and is_mapping(address) and assembler is not None:
-                assembler.distrust(cob_id - 0x600)
+            if self.unsettles(cob_id - 0x600, data):
+                self._assemblers[cob_id - 0x600].distrust(cob_id - 0x600)
+
+    def unsettles(self, node: int, data: bytes) -> str:
+        """Return what an SDO frame of a master begins to write that its frames are read by; or nothing."""
+        address, layout = written_object(data), self._in_use.get(node)
+        if address is None or layout is None:
+            return ""
+        return "mapping" if is_mapping(address) else "units" if address in dict(layout.reported) else ""
 
     def sync(self) -> Sequence[Mismatch]:
         """Process a SYNC, after the assemblers: new mappings apply from here on.

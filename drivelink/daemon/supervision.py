@@ -15,7 +15,6 @@ from drivelink.canopen.configure import Configurator
 from drivelink.canopen.emcy import NMT_STATES, nmt_state, parse_emergency
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.canopen.sdo import is_mapping, written_object
 from drivelink.cycle.following import MapFollower, PassiveFollower
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.objectcheck import ObjectCheck, ReadBack
@@ -276,10 +275,10 @@ class Supervisor:
         self._overhear(cob_id, data)
         if self._read_back is not None:
             self._read_back.quiet(self._loop.clock() / _NS)
-        address = written_object(data)
-        if address is not None and is_mapping(address):
-            text = f"node {cob_id - 0x600}: somebody else writes its mapping: it is configured again"
-            self._of(cob_id - 0x600).report(text, logging.WARNING)
+        node = cob_id - 0x600
+        if written := self._follower.unsettles(node, data):
+            text = f"node {node}: somebody else writes its {written}: it is configured again"
+            self._of(node).report(text, logging.WARNING)
 
 
 def _maps(layout: NodeLayout) -> str:

@@ -11,7 +11,7 @@ const MODE: u16 = 0x6060; // mode of operation (CiA 402-2, 8.5.3)
 const HOMING: u8 = 6;
 const ATTAINED: i64 = 0x1000; // bits of the statusword in that mode: homing attained …
 const FAILED: i64 = 0x2000; // … and homing error
-const HOME: [u16; 2] = [0x607C, 0x6098]; // home offset, homing method (CiA 402-2, 11.4)
+const HOME: [u16; 3] = [0x607C, 0x6098, 0x6003]; // home offset, homing method (CiA 402-2, 11.4); preset (CiA 406)
 
 /// What became of one node's frames since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -136,7 +136,7 @@ impl Node {
         }
     }
 
-    /// A frame of an SDO client: a homing, or another home offset, moves the zero of its positions.
+    /// A frame of an SDO client: a homing, another home offset or a preset moves the zero of its positions.
     pub fn request(&mut self, data: &[u8]) {
         // Initiate download, expedited or not, and block download.
         let [command, low, high, _, value, _, _, _] = *data else { return };
@@ -227,6 +227,7 @@ mod tests {
             ([0x2F, 0x60, 0x60, 0, 8, 0, 0, 0], false),
             ([0x23, 0x7C, 0x60, 0, 0x10, 0x27, 0, 0], true),
             ([0x2F, 0x98, 0x60, 0, 0x23, 0, 0, 0], true), // homing method
+            ([0x23, 0x03, 0x60, 0, 0xE8, 3, 0, 0], true), // an encoder's preset
             ([0x21, 0x7C, 0x60, 0, 4, 0, 0, 0], true),    // by segments
             ([0xC6, 0x7C, 0x60, 0, 4, 0, 0, 0], true),    // by blocks
             ([0x40, 0x7C, 0x60, 0, 0, 0, 0, 0], false),   // an upload changes nothing

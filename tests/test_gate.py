@@ -21,9 +21,9 @@ import pytest
 from drivelink import jointfile, recording
 from drivelink.cli import main
 from drivelink.jointfile import parse
-from drivelink.recording.corrections import corrections
+from drivelink.recording.corrections import _line, corrections
 from estimator import JointModel, Record
-from estimator.gate import Change, Discrepancy, examine, judge
+from estimator.gate import Change, Discrepancy, Judgement, examine, judge
 from estimator.gate.causes import causes
 from estimator.identify import identify
 from sim.cases import case
@@ -280,6 +280,26 @@ def test_what_comes_from_drives_is_corrected_at_the_drive(changes, lines):
     )  # wrongly, it turns out
     (back,) = corrections(turned, [Change("motor2_torque", -1.0)], live=True)
     assert str(back) == "motor[2].drive.torque_direction = 1"
+
+
+@pytest.mark.parametrize(
+    ("declared", "line"),
+    [
+        ("", "at the top of the joint file: recording.scale = { link_position_rad = -1 }"),
+        ('recording.folder = "kept"\n', "in [recording] of the joint file: scale = { link_position_rad = -1 }"),
+        (
+            "recording.scale = { motor1_torque_nm = 2 }\n",
+            "instead of the scale in the joint file: recording.scale = { motor1_torque_nm = 2, link_position_rad = -1 }",
+        ),
+    ],
+)  # fmt: skip
+def test_the_line_for_columns_fits_what_the_joint_file_has(declared, line):
+    turned = (Change("link_position", -1.0),)
+    finding = Discrepancy(
+        kind="sign", what="", changes=turned, motors=2, log_odds=9.0, left_before=1.0, left_after=0.1
+    )
+    judgement = Judgement(findings=(finding,))
+    assert _line(parse(declared + DRIVES), judgement, live=False).split("if so, ")[1].startswith(line)
 
 
 def _measured(path: str, joint: str) -> tuple[Record, JointModel]:

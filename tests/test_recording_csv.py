@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile, parse
 from drivelink.recording import read
+from drivelink.recording.columns import parse_column_map
 from drivelink.recording.grid import find_grid
 
 SINGLE = 'name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
@@ -87,6 +88,8 @@ def test_a_current_becomes_a_torque_at_the_joint(tmp_path):
     path = write(tmp_path / "r.csv", table, names)
     record = read(path, parse(SINGLE + DRIVE))
     assert record.motor_torque_nm[:, 0] == pytest.approx(table[:, 2] * 0.05 * 50.0, rel=1e-15)
+    turned = parse("recording.scale = { motor1_torque_nm = -1 }\n" + SINGLE + DRIVE)  # as the gate says
+    assert np.array_equal(read(path, turned).motor_torque_nm, -record.motor_torque_nm)
     with one_line("", "motor[1].drive.torque_constant_nm_a"):
         read(path, parse(SINGLE))
 
@@ -208,6 +211,28 @@ def test_what_spreadsheets_make_of_a_file_is_read(tmp_path):
     path.write_bytes("\r\n".join([*lines, ""]).encode("utf-8"))
     record = read(path)
     assert np.array_equal(record.motor_position_rad[:, 0], table[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("start", "encoding"),
+    [("sep=,\n", "utf-8"), ("", "cp1252"), ("# measured on a bench, by hand\n# ", "utf-8")],
+)
+def test_headers_of_excel_windows_and_numpy_are_read(tmp_path, start, encoding):
+    path = tmp_path / "r.csv"
+    names = "time_s,motor1_position_rad,motor1_torque_nm,Winkel [°]"
+    lines = [names, *(",".join(map(repr, row)) for row in rows().tolist())]
+    path.write_bytes((start + "\n".join([*lines, ""])).encode(encoding))
+    record = read(path, names=parse_column_map(["Winkel [°]=link_position_rad"]))
+    assert record.link_position_rad is not None and len(record) == len(rows())
+
+
+def test_a_header_without_known_columns_is_shown_whole(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_text("Zeit [ms];Position Motor 1 [°];Strom Motor 1 [mA];Drehzahl Motor 1;Winkel\n0;1;2;3;4\n")
+    with one_line(
+        f"{path}: ", "found Zeit [ms], Position Motor 1 [°], Strom Motor 1 [mA], Drehzahl Motor 1, Winkel ("
+    ):
+        read(path)
 
 
 def test_a_last_line_that_a_crash_cut_off_is_left_out(tmp_path, said):

@@ -103,7 +103,7 @@ def renamed(
         if source.column not in columns:
             by = f"--map {source.column}={name}" if source.asked else f"recording.columns.{name}"
             raise RecordingError(
-                f"{where}: {by}: no such column {source.column!r}, found {', '.join([*columns, *unread])}"
+                f"{where}: {by}: no such column {source.column!r}, found {some([*columns, *unread], 40)}"
             )
     used = {source.column for source in names.values()}
     kept = {name: values for name, values in columns.items() if name not in used and name not in names}
@@ -321,7 +321,7 @@ class _Table:
         return values
 
     def torque(self, number: int) -> FloatArray:
-        """Return a motor's joint-side torque: as recorded, or current * torque constant * gear ratio."""
+        """Return a motor's joint-side torque: as recorded, or current * constant * gear ratio * scale."""
         torque, current = f"motor{number}_torque_nm", f"motor{number}_current_a"
         if torque in self.columns or current not in self.columns:
             return self.needed(torque, f" (or {current})")
@@ -332,7 +332,8 @@ class _Table:
                 f"{self.where}: {current} needs motor[{number}].drive.torque_constant_nm_a (and gear_ratio) "
                 "in the joint file to become a torque"
             )
-        return amperes * (drive.torque_constant_nm_a * drive.gear_ratio)
+        scale = self.joint.recording.scale.get(torque, 1.0) if self.joint else 1.0
+        return amperes * (drive.torque_constant_nm_a * drive.gear_ratio * scale)
 
     def require(self, name: str, other: str = "") -> None:
         """Require a column, with values or not."""

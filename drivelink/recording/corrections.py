@@ -20,6 +20,7 @@ from estimator.gate import Change, Discrepancy, Judgement, check, is_held, judge
 from estimator.model import JointModel
 from estimator.sample import Record, Sample
 
+_SCALE = "recording.scale"
 _ON_THE_BUS = (".drive", ".encoder")
 _HELD = (
     "the link position does not change: the link is taken to be held, and its dynamics are left out; "
@@ -123,10 +124,10 @@ def _text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -
     """Return the correction as text for the joint file."""
     changes = [change for finding in findings for change in finding.changes]
     found = corrections(joint, changes, live=live)
-    scale = ", ".join(f"{c.key} = {c.value:.7g}" for c in found if c.table == "recording.scale")
-    parts = [f"{c}" for c in found if c.table != "recording.scale"]
-    if scale:
-        parts.insert(0, f"at the top of the joint file: recording.scale = {{ {scale} }}")
+    parts = [f"{c}" for c in found if c.table != _SCALE]
+    if scale := {c.key: c.value for c in found if c.table == _SCALE}:
+        whole = ", ".join(f"{key} = {value:.7g}" for key, value in (joint.recording.scale | scale).items())
+        parts.insert(0, f"{_place(joint)}scale = {{ {whole} }}")
     if any(change.channel == "deflection" for change in changes):
         parts.append("record link_position_rad as 2 motor1_position_rad - link_position_rad")
     text = "; ".join(parts)
@@ -135,6 +136,14 @@ def _text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -
         if keys:
             text += f" (for what drivelink itself reads from the drives: {'; '.join(keys)})"
     return text
+
+
+def _place(joint: JointFile) -> str:
+    """Return where the line of scales goes: a TOML table may not be begun twice."""
+    if joint.recording.scale:
+        return "instead of the scale in the joint file: recording."
+    declared = "recording" in joint.model_fields_set
+    return "in [recording] of the joint file: " if declared else "at the top of the joint file: recording."
 
 
 def corrections(joint: JointFile, needed: Sequence[Change], *, live: bool) -> list[Correction]:
@@ -169,12 +178,9 @@ def _column(joint: JointFile, change: Change, number: int = 0) -> Correction:
     """Return a factor for a column, times the present one."""
     names = {"time": "time_s", "link_position": "link_position_rad"}
     names |= {f"motor{number}_position": f"motor{number}_position_rad"}
-    scale = joint.recording.scale
-    torque = f"motor{number}_torque_nm"
-    if change.channel == f"motor{number}_torque" and f"motor{number}_current_a" in scale:
-        torque = f"motor{number}_current_a"
-    name = names.get(change.channel, torque)
-    return Correction("recording.scale", name, change.factor * scale.get(name, 1.0), change.factor)
+    name = names.get(change.channel, f"motor{number}_torque_nm")
+    now = joint.recording.scale.get(name, 1.0)
+    return Correction(_SCALE, name, change.factor * now, change.factor)
 
 
 def _of_drive(

@@ -19,6 +19,7 @@ from drivelink.errors import RecordingError
 from drivelink.files import open_regular
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.columns import COLUMNS
+from drivelink.plaintext import some
 from drivelink.recording.canlog import CAN_FORMATS
 from drivelink.recording.columns import ColumnMap
 from drivelink.recording.limits import MAX_COLUMNS, require_samples, whole_lines
@@ -33,8 +34,8 @@ _EMPTY = frozenset({"", "null", "none", "n/a", "na", "-"})  # cells without a va
 def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     """Read the known columns (docs/reference/recordings.md); an empty cell is NaN.
 
-    Accepts comma, semicolon or tab as separator, decimal commas with the latter two, a byte-order mark and
-    `#` comments before the header. A last line without end is omitted, because it may be incomplete.
+    Accepts comma, semicolon or tab as separator, decimal commas with the latter two, a byte-order mark,
+    Windows-1252, and `#` comments. A last line without end is omitted, because it may be incomplete.
 
     Args:
         names: columns with other names in the file.
@@ -80,35 +81,52 @@ class _Layout(NamedTuple):
 
 def _opened(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[_Layout, Iterator[list[float]]]:
     """Return the layout of a file, and its rows."""
-    header, line = _header(file, path)
-    layout = _layout(header, path, names)
+    known = COLUMNS | {source.column for source in names.values()}
+    header, line = _header(file, path, known)
+    layout = _layout(header, path, known)
     return layout, _rows(file, layout, path, line)
 
 
-def _header(file: IO[bytes], path: Path) -> tuple[str, int]:
+def _header(file: IO[bytes], path: Path, known: frozenset[str]) -> tuple[str, int]:
     """Header line, and the number of the line after it."""
     for number, line in enumerate(whole_lines(file, path), start=1):
         if number == 1 and line.startswith((b"\xff\xfe", b"\xfe\xff")):
             raise RecordingError(f"{path}: expected UTF-8 text, got UTF-16 (save it as plain CSV)")
-        text = line.removeprefix(b"\xef\xbb\xbf").strip()
-        if text and not text.startswith(b"#"):
+        text = _text(line.removeprefix(b"\xef\xbb\xbf")).strip()
+        header = text.lstrip("# ")
+        if not header or (number == 1 and header.startswith("sep=")):  # a spreadsheet's separator
+            continue
+        # A comment that names time, position and torque is the header: so numpy.savetxt writes it.
+        if header == text or len(known.intersection(_names(header)[0])) >= 3:
             if b"\0" in line:
                 break
-            return text.decode("utf-8", errors="replace"), number + 1
+            return header, number + 1
     raise RecordingError(f"{path}: expected a CSV file with a line of column names, got no text")
 
 
-def _layout(header: str, path: Path, wanted: ColumnMap) -> _Layout:
+def _text(line: bytes) -> str:
+    """Return a line that is UTF-8, or of Windows' western code page."""
+    try:
+        return line.decode()
+    except UnicodeDecodeError:
+        return line.decode("cp1252", errors="replace")
+
+
+def _names(header: str) -> tuple[tuple[str, ...], str]:
+    """Return the names in a header, and what separates them."""
     separator = max(",;\t", key=header.count)
-    if (count := header.count(separator) + 1) > MAX_COLUMNS:
-        raise RecordingError(f"{path}: expected at most {MAX_COLUMNS} columns, got {count}")
-    names = tuple(name.strip().strip("\"'").strip() for name in header.split(separator))
-    sources = {source.column for source in wanted.values()}
-    used = tuple(name for name in names if name in COLUMNS or name in sources)
+    return tuple(name.strip().strip("\"'").strip() for name in header.split(separator)), separator
+
+
+def _layout(header: str, path: Path, known: frozenset[str]) -> _Layout:
+    names, separator = _names(header)
+    if len(names) > MAX_COLUMNS:
+        raise RecordingError(f"{path}: expected at most {MAX_COLUMNS} columns, got {len(names)}")
+    used = tuple(name for name in names if name in known)
     if not used:
         raise RecordingError(
-            f"{path}: expected a header with time_s, motor1_position_rad, motor1_torque_nm, …, "
-            f"got {header[:60]!r} (--map SOURCE=COLUMN[:UNIT] or [recording.columns] says which is which)"
+            f"{path}: expected a header with time_s, motor1_position_rad, motor1_torque_nm, …, found "
+            f"{some(names, 40)} (--map SOURCE=COLUMN[:UNIT] or [recording.columns] says which is which)"
         )
     twice = {name for name in names if name and names.count(name) > 1}
     if twice:

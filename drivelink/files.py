@@ -62,7 +62,7 @@ def check_target(
         makes_folder: whether its folder is made where there is none.
 
     Raises:
-        UsageError: it is an input or a folder, it exists, or its folder is none.
+        UsageError: it is an input or a folder, it exists, or its folder is none or read-only.
     """
     for given in inputs:
         if _same(path, given):
@@ -75,6 +75,9 @@ def check_target(
         raise UsageError(f"{path}: there is no folder {path.parent}")
     if not force and path.is_file():
         raise UsageError(f"{path}: exists already; force=True replaces it")
+    folder = next(one for one in path.absolute().parents if one.exists())
+    if not os.access(folder, os.W_OK) and (path.is_file() or not path.exists()):
+        raise UsageError(f"{path}: the folder {folder} cannot be written to")
 
 
 def _same(path: Path, other: Path) -> bool:

@@ -94,6 +94,15 @@ def test_a_write_protected_file_is_not_replaced(folder):
         write_whole(path, "new", force=True)
 
 
+def test_a_folder_that_cannot_be_written_to_is_said_before_any_work(folder, monkeypatch):
+    (folder / "there.txt").write_text("kept")
+    monkeypatch.setattr(os, "access", lambda path, _mode: path != folder)  # what a read-only medium says
+    for path in (folder / "new.txt", folder / "there.txt", folder / "sub" / "new.txt"):
+        with pytest.raises(UsageError, match=f"the folder {folder} cannot be written to"):
+            check_target(path, force=True, makes_folder=True)
+    check_target(Path("/dev/null"), force=True)
+
+
 FULL = """
 import resource, signal, sys
 from pathlib import Path

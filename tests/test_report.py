@@ -16,7 +16,7 @@ from rich.console import Console
 from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.jointfile.apply_diagnosis import floor_entry, make_model_monitor
-from drivelink.output import plots, progress, report
+from drivelink.output import document, plots, progress, report
 from drivelink.output.document import Document, Grid, Section, page, show
 from drivelink.output.numbers import Units
 from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
@@ -76,6 +76,20 @@ def test_json_is_pure_and_a_page_without_a_curve_has_no_empty_section(folder, ca
     assert "What reveals it" not in page and "What could not be separated" not in page
     assert "<th>probability" not in page and not re.search(
         r"e-\d", page[page.index("Error of") : page.index("<svg")]
+    )
+
+
+def test_a_full_disk_loses_no_finding(folder, monkeypatch, capsys):
+    def full(path, *_, **__):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(document, "write_whole", full)
+    arguments = ["diagnose", str(folder / "clean.csv"), "--joint", str(folder / "joint.toml")]
+    assert main([*arguments, "--out", str(folder / "full")]) == 1
+    said = capsys.readouterr()
+    assert "The model is sufficient" in said.out
+    assert (
+        said.err.splitlines()[-1] == f"drivelink diagnose: {folder}/full/report.json: No space left on device"
     )
 
 

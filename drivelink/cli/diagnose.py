@@ -7,7 +7,7 @@ from pathlib import Path
 
 from drivelink import analysis
 from drivelink.cli import add_number, add_recordings, conclude, recording_path, require_distinct, warn, wrote
-from drivelink.errors import HarmfulModelError, UsageError
+from drivelink.errors import UsageError
 from drivelink.files import check_target
 from drivelink.output.progress import Meter
 from drivelink.recording.mapping import joint_of
@@ -87,16 +87,13 @@ def run(args: argparse.Namespace) -> int:
         )
         if args.motion is not None:
             found = found.next_motion(args.motion_seconds, meter.stage)
-    made, harmful = found.report(args.out), None
-    if found.motion is not None:
-        made += found.write_motion(args.motion, force=args.force)
-    if args.write is not None:
-        try:
+    conclude(args.json, found.as_json(), found.sections())  # before anything is written, as `fit` does
+    made = found.report(args.out)
+    try:
+        if found.motion is not None:
+            made += found.write_motion(args.motion, force=args.force)
+        if args.write is not None:
             made.append(found.write(args.write, force=args.force))
-        except HarmfulModelError as error:
-            harmful = error  # what was found comes first
-    conclude(args.json, found.as_json(), found.sections())
-    wrote(args.json, made)
-    if harmful is not None:
-        raise harmful
+    finally:
+        wrote(args.json, made)
     return 0

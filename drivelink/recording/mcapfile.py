@@ -261,7 +261,7 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
             most = 2 * len(waiting) + _FEW
     yield from _released(waiting, None, factors)
     if not found:
-        raise RecordingError(f"{path}: no samples in it (with raw frames in it: replay --frames)")
+        raise _empty(path)
 
 
 def _whole(number: float | None) -> int:
@@ -316,7 +316,7 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
         count += 1
         require_samples(count, str(path))
     if not count:
-        raise RecordingError(f"{path}: no samples in it (with raw frames in it: replay --frames)")
+        raise _empty(path)
     table = {name: np.frombuffer(values, dtype=np.float64) for name, values in columns.items()}
     return record_from_columns(table, str(path), joint, keep_nan)
 
@@ -330,6 +330,13 @@ def _gone_on(time_s: array[float], shift_s: float, elapsed_ns: int, period_s: fl
     behind_s = period_s * round(behind_s / period_s) if period_s else behind_s
     time_s[-1] += behind_s
     return shift_s + behind_s
+
+
+def _empty(path: Path) -> RecordingError:
+    return RecordingError(
+        f"{path}: no samples in it (with raw frames in it: replay --frames; a bag of ROS, or another "
+        "program's file: export its columns as CSV)"
+    )
 
 
 def _strange(path: Path, topic: str, error: Exception) -> RecordingError:

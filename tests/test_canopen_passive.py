@@ -287,3 +287,12 @@ def test_what_followed_a_node_is_freed_with_the_last_reference_to_it():
     left = [weakref.ref(checked), weakref.ref(configurator._nodes[5])]
     del configurator, checked
     assert [one() for one in left] == [None, None]
+
+
+def test_a_master_that_writes_a_unit_again_and_again_fills_no_log(caplog):
+    configurator = PassiveConfigurator([parse(joint_text(drive=STATED + MAP, bus=PASSIVE))])
+    for k in range(100):
+        configurator.feed(0x605, bytes.fromhex("23766000") + (1000 + k).to_bytes(4, "little"), 0.0)
+        configurator.feed(0x585, bytes.fromhex("6076600000000000"), 0.0)
+        configurator.poll(0.0)
+    assert "(0x6076)" in caplog.text and 0 < len(caplog.messages) <= 16

@@ -471,7 +471,7 @@ def test_mappings_that_change_without_a_sync_end_at_the_limit_not_at_the_file_s_
     path.write_text("c 080#\n" * 8 + "".join(toggled) * 10_000)
     with one_line("changes of what its nodes send"):
         read(path, parse(TEXT + "[bus]\nconfigure = false\n"))
-    assert len(calls) < 10_000
+    assert len(calls) < 5000
 
 
 def _mapped(entries):

@@ -142,7 +142,7 @@ class PassiveConfigurator:
                 self.doubts[node_id] = doubt
             before, self.layouts[node_id] = self.layouts.get(node_id), layout
             if layout != before:
-                log_notices(logger, layout.notices)
+                log_notices(logger, node.untold(layout.notices))
                 ended.append((node_id, layout))
         return ended
 

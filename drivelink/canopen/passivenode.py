@@ -14,6 +14,7 @@ from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import VENDORS, vendor_of
 from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection, TpdoSection
+from drivelink.notice import Notice
 
 Address = tuple[int, int]
 
@@ -24,6 +25,7 @@ _IDENTITY = tuple((0x1018, subindex) for subindex in (1, 2, 3, 4))
 _STORED = ((0x1020, 1), (0x1020, 2))  # date and time of the configuration
 _STORE_OR_RESTORE = (0x1010, 0x1011)
 _VOLATILE = frozenset({(0x1005, 0), (0x1006, 0), (0x1017, 0), (0x1019, 0)})  # as after power-on
+_MOST_TOLD = 16  # findings of a node that are told; one may come of each unit that its master writes
 _MOST_ENTRIES = 8  # of a map whose objects are whole bytes
 
 
@@ -52,6 +54,7 @@ class PassiveNode:
         self._identity: dict[Address, int] = {}
         self._offered: tuple[dict[Address, int], Offer | None] = {}, None  # by the units before it
         self.heard: dict[int, int] = {}  # lengths of frames with its predefined identifiers
+        self._told: set[Notice] = set()
 
     def restart(self) -> None:
         """Handle a boot-up: mapping and parameters are the node's defaults again."""
@@ -85,6 +88,12 @@ class PassiveNode:
                 self._identity[address], self.stored = value, True
                 if address not in self.listener.written:
                     self.lose_sight("it has another identity or date of configuration than before")
+
+    def untold(self, notices: Iterable[Notice]) -> list[Notice]:
+        """Return the findings that were not told before, while there are not too many."""
+        untold = [one for one in notices if one not in self._told][: _MOST_TOLD - len(self._told)]
+        self._told.update(untold)
+        return untold
 
     def dispute(self) -> str:
         """Return one line on an object whose value is not known although it was transferred; empty: none."""

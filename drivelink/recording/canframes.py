@@ -42,8 +42,8 @@ _LOG = logging.getLogger("drivelink.recording")
 _QUIET_SYNCS = 500  # without a change, the configuration has ended
 _MOST_HELD = 1 << 18  # frames among them: more than a bus of 127 nodes sends
 _WITHOUT_SYNC = 100_000  # frames: half a minute of a bus whose master does not run
-_FEW_MAPPINGS = 5000  # changes of what a node sends that any file may have: to configure one makes dozens
-_RECORDS_OF_A_MAPPING = 64  # of the file, for each further one: it costs as much as dozens of them
+_FEW_MAPPINGS = 2500  # changes of what a node sends that any file may have: to configure one makes dozens
+_RECORDS_OF_A_MAPPING = 128  # of the file, for each further one: it costs as much as so many of them
 _PEEK = 20_000  # messages that show whether an MCAP file has samples
 
 

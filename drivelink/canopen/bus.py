@@ -271,6 +271,8 @@ def sender(bus: FrameBus) -> Callable[[int, bytes], None]:
                 logger.debug("frame 0x%03X is lost: the transmit queue is full", cob_id)
                 return
             raise BusError(f"frame 0x{cob_id:03X} cannot be sent: {one_line(str(error))}") from error
+        except OSError as error:  # of an interface over TCP
+            raise BusError(f"frame 0x{cob_id:03X} cannot be sent: {error.strerror or error}") from error
 
     return send
 

@@ -86,6 +86,15 @@ PROTECTIONS = [
         ("valid and impossible", "pubsub/wire.py", "if message.status & _VALID and not _usable(message):", "if False:", "tests/test_wire.py"),
         ("floods of queries", "pubsub/publisher.py", "zenoh.handlers.RingChannel(_QUERIES)", "zenoh.handlers.FifoChannel(10_000)", "tests/test_publisher.py -k flood"),
         ("rows of a part", "fleet/table.py", "        if left < 0:", "        if False:", "tests/test_fleet_table.py -k stands_in_a_part"),
+        ("units that another master writes", "cycle/following.py", ' else "units" if address in dict(layout.reported) else ""', ' else ""', "tests/test_read_back.py -k writes_a_unit"),
+        ("findings that are told", "canopen/passive.py", "node.untold(layout.notices)", "layout.notices", "tests/test_canopen_passive.py -k fills_no_log"),
+        ("frames at once", "cycle/sources.py", "while len(messages) < MOST_FRAMES and", "while len(messages) < 5000 and", "tests/test_interfaces.py -k 11_bits"),
+        ("a server that has gone", "canopen/bus.py", "        except OSError as error:  # of an interface over TCP", "        except ValueError as error:", "tests/test_canopen_mapping.py -k full_transmit"),
+        ("levels of a document", "pubsub/feed.py", "if depth == MAX_DEPTH:", "if False:", "tests/test_network_attacks.py -k each_limit"),
+        ("size of a snapshot", "recording/recorder.py", "if not 8 < len(payload) <= MAX_BLOCK_BYTES:", "if False:", "tests/test_network_attacks.py -k snapshot"),
+        ("a stamp that jumps", "pubsub/feed.py", "min(elapsed_ns // step, _LONGEST_PERIOD_NS)", "elapsed_ns // step", "tests/test_client.py -k jumps"),
+        ("daemons that begin at once", "pubsub/publisher.py", "if any(other < own for", "if False and any(other < own for", "tests/test_session.py -k smaller"),
+        ("frames that wait", "recording/canframes.py", "if len(head) > _MOST_HELD:", "if False:", f"{LIMITS} -k wait_for"),
         ("a scheduler with certificates", "fleet/runner.py", 'if not address.startswith("tls://") and not insecure:', "if False:", "tests/test_fleet_run.py -k certificates"),
     )
 ]  # fmt: skip

@@ -12,6 +12,7 @@ from canopenkit import (
     DEVICE_STATE,
     INVALID,
     NO_RTR,
+    RANGE,
     READ_ONLY,
     TOO_MANY,
     Slave,
@@ -239,6 +240,31 @@ def test_unneeded_frames_are_switched_off_where_the_load_demands_it():
     assert configurator.load().bits_per_s == pytest.approx(1000 * (55 + 4 * 135) + 4 * 10 * 65)
 
 
+class SameIdentifiers(Slave):
+    """Refuses other identifiers than it has."""
+
+    def _check_pdo(self, address, item, value):
+        changed = address[0] < 0x1A00 and address[1] == 1 and (value ^ item.value) & 0x7FF
+        return RANGE if changed else super()._check_pdo(address, item, value)
+
+
+def test_a_frame_that_shares_its_identifier_with_ours_is_switched_off_whatever_the_load():
+    slave = SameIdentifiers(5, drive_objects(5) | tpdo(4, NO_RTR | 0x185, 1, STATUS))
+    _, layout = configured(slave)
+    assert layout.tpdos[0].cob_id == 0x185 and slave.objects[0x1803, 1].value & INVALID
+
+
+class Stopped(Slave):
+    """Stopped by somebody, it has no SDO (CiA 301, 7.3.2.2.4)."""
+
+    def handle(self, cob_id, data):
+        return [] if cob_id and self.state == 4 else super().handle(cob_id, data)
+
+
+def test_a_node_that_was_stopped_before_we_came_is_woken():
+    configured(Stopped(5, drive_objects(5), state=4))
+
+
 class Failing(Wire):
     """A bus that every third frame cannot be sent to."""
 
@@ -260,7 +286,9 @@ def test_a_full_transmit_queue_costs_time_only_and_an_interface_that_is_down_is_
     assert layout.tpdos[0].cob_id == 0x185
     with pytest.raises(BusError, match=r"cannot be sent: .*Network is down"):
         configure(Failing(errno.ENETDOWN, "Network is down", [drive()]), parse(joint_text()))
-    wire.error = BrokenPipeError(errno.EPIPE, "Broken pipe")  # by a server that has gone: it is no closed stdout
+    wire.error = BrokenPipeError(
+        errno.EPIPE, "Broken pipe"
+    )  # by a server that has gone: it is no closed stdout
     with pytest.raises(BusError, match=r"cannot be sent: Broken pipe"):
         configure(wire, parse(joint_text()))
 

@@ -29,7 +29,7 @@ from drivelink._core import encode_estimate
 from drivelink.errors import ZenohError
 from drivelink.jointfile import parse
 from drivelink.pubsub import wire
-from drivelink.pubsub.feed import Arrivals
+from drivelink.pubsub.feed import Arrivals, Feed
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_client, open_session
 from estimator.sample import Estimate, Status, TransmissionEstimate
@@ -185,6 +185,13 @@ def test_arrival_is_the_stamp_moved_by_the_smallest_difference_seen():
         arrivals.empty(1_000)
         arrivals.came(stamp_ns, 2_000)
         assert 0 <= arrivals.age_ns(2_000) <= 1_000
+
+
+def test_after_a_stamp_that_jumps_an_estimate_is_stale_in_time_all_the_same():
+    feed = Feed(8, None, 0)
+    for number, stamp_ns in enumerate((1, 3_600_000_000_000), start=1):
+        feed.admit(encode_estimate(make_estimate(number), stamp_ns), number, False)
+    assert not feed.stale(1_000_000_000) and feed.stale(10_000_000_000)
 
 
 def test_the_daemons_death_and_return_are_states(endpoint):

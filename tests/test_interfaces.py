@@ -17,7 +17,7 @@ from zenohkit import free_port, until
 
 from drivelink._core import JointPipeline
 from drivelink.canopen.bus import open_bus
-from drivelink.cycle.sources import BusLostError, BusSource, open_source
+from drivelink.cycle.sources import MOST_FRAMES, BusLostError, BusSource, open_source
 from drivelink.daemon.service import Daemon
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
@@ -179,6 +179,18 @@ def test_a_time_that_no_interface_can_mean_is_that_of_the_reading(stamp_s):
     before_ns = time.time_ns()
     ((_, _, stamp_ns),) = BusSource(bus).receive()
     assert before_ns <= stamp_ns <= time.time_ns()
+
+
+def test_of_any_interface_data_frames_of_11_bits_are_taken_and_so_many_at_once():
+    def frame(**kind):
+        return can.Message(**{"arbitration_id": 0x181, "is_extended_id": False, **kind})
+
+    strange = [frame(is_extended_id=True), frame(is_remote_frame=True, dlc=8)]
+    bus = SimpleNamespace(recv=lambda _timeout: strange.pop() if strange else frame())
+    assert len(BusSource(bus).receive()) == MOST_FRAMES - 2
+    bus.recv = lambda _timeout: int("xyz", 16)  # what python-can makes of a server's nonsense
+    with pytest.raises(BusLostError, match="xyz"):
+        BusSource(bus).receive()
 
 
 def test_error_frames_of_any_interface_are_counted_by_kind():

@@ -5,6 +5,7 @@ import json
 import math
 import time
 from contextlib import contextmanager
+from functools import reduce
 from struct import pack
 from types import SimpleNamespace
 
@@ -129,6 +130,19 @@ def test_whatever_a_document_holds_it_is_refused_in_a_line_or_made_safe(name):
         assert all(len(line.plain) <= width for line in status_lines(document, width))
     assert json.dumps(snapshot(view, True, {}), allow_nan=False)
     assert len(status_text(document)) < 2000 and shape(document)
+
+
+@pytest.mark.parametrize(
+    ("document", "said"),
+    [
+        ({"a": "x" * feed.MAX_BYTES}, "bytes"),
+        (reduce(lambda inner, _: {"a": inner}, range(feed.MAX_DEPTH + 1), {}), "levels"),
+        ({"a": [0] * feed.MAX_ELEMENTS}, "elements"),
+    ],
+)
+def test_each_limit_of_a_document_is_its_own(document, said):
+    with pytest.raises(ZenohError, match=said):
+        feed.decode_document(json.dumps(document).encode())
 
 
 def test_what_is_well_formed_stays_as_it_is():
@@ -319,3 +333,19 @@ def test_nothing_that_a_daemon_publishes_ends_the_monitor_the_recorder_or_a_clie
         assert all(tap.refused >= 4 for tap in taps)
     rows = (tmp_path / "r.csv").read_text().splitlines()
     assert len(rows) >= 2 and len({row.count(",") for row in rows}) == 1
+
+
+def test_a_snapshot_that_no_reader_takes_is_not_kept(publisher, endpoint, monkeypatch):
+    monkeypatch.setattr("drivelink.recording.recorder.MAX_BLOCK_BYTES", 1 << 10)
+    session, states = open_client(endpoint), []
+    sink = SimpleNamespace(wants={"snapshot"}, snapshot=states.append)
+    tap = ZenohTap(session, make_joint("elbow", endpoint), sink)
+    until(lambda: publisher.snapshot_wanted)
+    for refused, state in enumerate((b"", bytes(1 << 10)), start=1):
+        publisher.put_snapshot(1, state)
+        until(lambda refused=refused: tap.poll() or tap.refused == refused)
+    publisher.put_snapshot(1, b"state")
+    until(lambda: tap.poll() or states)
+    assert states == [b"state"]
+    tap.close()
+    close_session(session)

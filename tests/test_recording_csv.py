@@ -15,7 +15,7 @@ from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile, parse
 from drivelink.recording import read
 from drivelink.recording.columns import parse_column_map
-from drivelink.recording.grid import find_grid
+from drivelink.recording.grid import NotUniformError, find_grid
 
 SINGLE = 'name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
 DRIVE = "[motor.drive]\nnode_id = 1\ntorque_constant_nm_a = 0.05\ngear_ratio = 50.0\n"
@@ -164,6 +164,12 @@ def test_stamps_that_say_nothing_are_refused_with_the_command_that_numbers_the_r
     record = read(tmp_path / "my run-numbered.csv")
     assert record.period_s == pytest.approx(1e-3, rel=0.01)
     assert np.array_equal(record.motor_position_rad[:, 0], table[:, 1])
+
+
+def test_stamps_of_which_four_in_ten_steps_are_gaps_are_not_uniform():
+    places = np.arange(700.0)
+    with pytest.raises(NotUniformError):
+        find_grid(places[np.isin(places % 7, (0, 1, 2, 4, 6))], "r.csv")
 
 
 HEAD = "time_s,motor1_position_rad,motor1_torque_nm\n"

@@ -474,6 +474,13 @@ def test_mappings_that_change_without_a_sync_end_at_the_limit_not_at_the_file_s_
     assert len(calls) < 5000
 
 
+def test_frames_that_wait_for_a_configuration_to_end_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr("drivelink.recording.canframes._MOST_HELD", 500)
+    path = tmp_path / "r.log"
+    path.write_text(("c 080#\n" + "c 555#\n" * 99) * 20)
+    assert len(canframes.FrameLog(path, JOINT, tmp_path)._head) <= 501
+
+
 def _mapped(entries):
     return [f"601 2F001A00{entries:02d}000000", "581 60001A0000000000"]
 

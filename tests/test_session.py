@@ -5,7 +5,7 @@ import resource
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -98,6 +98,18 @@ def test_of_two_daemons_that_start_at_once_with_one_name_one_stays(endpoint):
         stays = other if one.poll() is not None else one
         ready(stays)
         assert stays.poll() is None
+
+
+@pytest.mark.parametrize(("other", "stays"), [("0", False), ("g", True)])
+def test_of_two_daemons_that_have_not_seen_each_other_the_one_with_the_smaller_id_stays(
+    other, stays, endpoint, monkeypatch
+):
+    met = iter([[], [f"drivelink/elbow/alive/{other}"]])
+    monkeypatch.setattr(JointPublisher, "_served", lambda _self: next(met))
+    refused = pytest.raises(ZenohError, match="another daemon already serves")
+    section = ZenohSection(endpoint=endpoint)
+    with closing(open_session(section, Path())) as session, nullcontext() if stays else refused:
+        JointPublisher(session, parse(joint_text("elbow", endpoint)))
 
 
 def test_all_daemons_are_met_before_anybody_is_asked(three):

@@ -28,7 +28,6 @@ _ANSWER_S = 0.3  # for the slowest node
 _LONGEST_NAME = 80  # characters of a device's name that are shown
 _GAP_S = 0.001  # between two requests: 127 of them must not fill a transmit queue
 _PROFILES = {301: "CiA 301", 401: "CiA 401 (I/O)", 402: "CiA 402 (drive)", 406: "CiA 406 (encoder)"}
-_MOST_STAMPS = 200_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +69,7 @@ class Traffic:
         cob_id, data = message.arbitration_id, bytes(message.data)
         self.counts[cob_id] = self.counts.get(cob_id, 0) + 1
         self.last[cob_id] = data
-        if cob_id == SYNC_COB_ID and len(self.sync_s) < _MOST_STAMPS:
+        if cob_id == SYNC_COB_ID:
             self.sync_s.append(received_ns(message) * 1e-9)
         elif 0x701 <= cob_id <= 0x77F and len(data) == 1:
             self.heartbeats[cob_id - 0x700] = nmt_state(data[0] & 0x7F)

@@ -254,8 +254,6 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
         if (before := waiting.get(number)) is not None:
             row, flags = row or before[1], flags | before[2]
         waiting[number] = message.log_time_ns, row, flags
-        if not found and len(waiting) > MAX_UNREAD:
-            break  # estimates of nothing
         if len(waiting) > most:
             yield from _released(waiting, min(newest.values()) if len(newest) > 1 else (0, 0), factors)
             most = 2 * len(waiting) + _FEW

@@ -116,11 +116,12 @@ def _fitted(motor: Motor, one: TransmissionFit) -> Motor:
             parameters=one.parameters,
             covariance=tuple(map(tuple, one.covariance.tolist())) if one.parameters else None,
         )
+    inertia = one.inertia_kg_m2 or motor.inertia_kg_m2  # none explains a torque that does not move the joint
     return replace(
         motor,
-        inertia_kg_m2=one.inertia_kg_m2,
+        inertia_kg_m2=inertia,
         viscous_damping_nm_s_rad=one.viscous_damping_nm_s_rad,
-        inertia_std_relative=min(one.nuisance_std["inertia"] / one.inertia_kg_m2, 1.0),
+        inertia_std_relative=min(one.nuisance_std["inertia"] / inertia, 1.0),
         viscous_damping_std_nm_s_rad=one.nuisance_std["damping"],
         transmission=transmission,
     )

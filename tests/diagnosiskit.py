@@ -120,6 +120,7 @@ class World:
         if gauge := effects.get("gauge_late_s", 0.0) / PERIOD_S:
             q = theta + np.interp(index - gauge, index, q - theta)
         q = np.interp(index - late, index, q) + effects.get("zero_rad", 0.0)
+        q = q + effects.get("eccentric_rad", 0.0) * np.sin(q + 1.0)
         torque = torque + TORQUE_NOISE * rng.standard_normal(len(torque))
         return joints.recorded(joints.quantise(theta, MOTOR_LSB), torque, joints.quantise(q, LINK_LSB))
 

@@ -15,6 +15,7 @@ import pytest
 import drivelink
 from drivelink import jointfile
 from drivelink.demo.simulate import world_from_joint
+from drivelink.jointfile.apply_diagnosis import as_read
 from estimator.choices import choice
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.heldout import Held
@@ -262,6 +263,7 @@ def test_the_simplest_within_one_standard_error_is_chosen(gain, best, chosen, mo
             keys=frozenset({(name, 0)}),
             scores=scores,
             terms=(),
+            bends=frozenset(),
             log_prior=lambda *_, prior=prior: prior,
         )
         for name, scores, prior in (
@@ -274,6 +276,7 @@ def test_the_simplest_within_one_standard_error_is_chosen(gain, best, chosen, mo
     monkeypatch.setattr(Held, "squared", lambda _, one: float(np.mean(np.exp(-2.0 * one.scores))))
     monkeypatch.setattr(Held, "_relative", lambda _, floor: np.square(floor))
     monkeypatch.setattr(Held, "_independent", lambda *_: 300.0)
+    monkeypatch.setattr("estimator.diagnosis.heldout.twins", lambda *_: ())
     held: Any = Held.__new__(Held)
     held.price, held.problem = 3.0, SimpleNamespace(floor=choice("floor"))
     for one, families, parameters in zip((simple, other, third), ("a", "ab", "abc"), (2, 3, 4), strict=True):
@@ -333,6 +336,27 @@ def test_a_spring_that_is_no_polynomial_is_no_play_where_the_order_is_open():
     law, phi = MODELS["polynomial"], np.linspace(0.01, 0.06, 6)
     stiffness = law.stiffness(phi, law.alpha(spring.parameters))
     assert stiffness == pytest.approx(kit.STIFFNESS + 3000.0 * phi, rel=0.03)
+
+
+def test_a_spring_that_the_declared_law_does_not_hold_is_no_finding_in_a_second_recording():
+    first, second = (kit.World([{"bend_nm_rad2": 1500.0}], seed=seed).run()[0] for seed in (1, 2))
+    model = _open_polynomial(kit.model())
+    (motor,) = model.motors
+    cubic = replace(model, motors=(replace(motor, transmission=replace(motor.transmission, order=2)),))
+    fitted = identify(first, cubic)
+    found = diagnose(second, as_read(fitted.model, first, fitted.surplus))
+    assert (found.verdict, found.effects) == ("sufficient", ())
+
+
+def test_what_the_motors_side_alone_leaves_open_is_said():
+    """Friction that differs between the directions, or an offset beside it; an encoder or a gear, once a turn."""
+    uneven, turning = kit.World([{"coulomb_nm": 0.4, "offset_nm": 0.15}, {"eccentric_rad": 0.006}]).run()
+    for record, names in (
+        (uneven, {"coulomb_friction", "asymmetric_friction"}),
+        (turning, {"encoder_eccentricity", "kinematic_error"}),
+    ):
+        (effect,) = diagnose(record, kit.model(linked=False)).effects
+        assert {effect.name, *effect.alternatives} >= names and effect.probability < 0.9
 
 
 def test_no_order_is_chosen_whose_coefficients_no_joint_file_holds():

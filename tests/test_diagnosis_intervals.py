@@ -151,6 +151,14 @@ def test_a_torque_that_is_often_at_its_limit_is_as_it_is():
     assert at_limit(replace(record, motor_torque_nm=few)).tolist() == [[100, 104]]
 
 
+def test_a_peak_that_rounding_makes_flat_is_not_clipped():
+    (record,) = kit.World([{}], seconds=2.0).run()
+    sine = np.sin(3.0 * np.arange(len(record)) * record.period_s)[:, None]
+    rounded, clipped = np.round(sine, 3), np.round(np.clip(sine, -1.0, 0.9), 3)
+    assert not len(at_limit(replace(record, motor_torque_nm=rounded)))
+    assert len(at_limit(replace(record, motor_torque_nm=clipped)))
+
+
 def test_a_declared_friction_errs_as_one_that_is_found():
     """Its sign changes over another velocity than declared: a healthy joint "lacked" an encoder's delay."""
     (record,) = kit.World([{"coulomb_nm": 2.0}], seconds=8.0).run()

@@ -10,14 +10,14 @@ import joints
 import numpy as np
 import pytest
 
-from estimator.batch import fit_joint
+from estimator.batch import fit, fit_joint
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
 from estimator.harm import Unseen, _Figure, harm, harm_of_parts
-from estimator.identify import identify
+from estimator.identify import _fitted, identify
 from estimator.model import JointModel, Transmission
 from estimator.model_monitor import measure_baseline
 from estimator.sample import FloatArray, Record
@@ -239,6 +239,13 @@ def test_the_last_quarter_is_judged_by_a_model_made_of_the_others(healthy):
 def test_a_variance_below_zero_is_no_certainty(variance, determined):
     found = middle(MODELS["linear"], np.array([100.0]), np.array([[variance]]), np.array([0.01]))
     assert found.determined is determined
+
+
+def test_an_inertia_of_zero_is_none_that_was_found(healthy):
+    """Where a joint is guided by hand and its drive is off, no inertia explains the torque that is read."""
+    motor = kit.model().motors[0]
+    (one,) = fit(healthy, kit.model())
+    assert _fitted(motor, replace(one, inertia_kg_m2=0.0)).inertia_kg_m2 == motor.inertia_kg_m2
 
 
 @pytest.mark.parametrize("linked", [True, False])

@@ -17,12 +17,10 @@ from estimator.diagnosis.declared import declared_laws
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.problem import Problem, stretches
 from estimator.diagnosis.result import Errors
+from estimator.diagnosis.twins import twins
 from estimator.sample import FloatArray, Record
 
 __all__ = ["Held", "Residual", "errors_of", "held_out", "residual_of", "wider"]
-
-
-_TWINS = ("load_dependent_friction", "back_driving_loss")
 
 
 class Residual(NamedTuple):
@@ -149,6 +147,8 @@ class Held:
     def margin(self, found: Fitted, rest: Fitted, of: Held | None = None) -> float:
         """Return how many times more than `confirms` asks for one model gains over another."""
         floor = rest.regression.floor if self._refines(found, rest) else self.problem.floor
+        if found.bends - rest.bends:  # a declared spring is a law, as declared effects are
+            floor = np.hypot(floor, self.problem.bent(rest))
         theirs, both = of or self, (found, rest)
         fall = (theirs.squared(rest) - self.squared(found)) / float(np.mean(self._relative(floor)))
         return min(fall, _in_errors(self.scores(found, both) - theirs.scores(rest, both)))
@@ -229,26 +229,18 @@ class Held:
             prior = np.where(as_likely, np.maximum(prior, found.log_prior(errors, self.price)), prior)
         odds = odds + prior
         for pair in self._twins(models):
-            sizes = [models[k].log_size(name) for k, name in zip(pair, _TWINS, strict=True)]
-            odds[:, pair] = np.max(odds[:, pair], axis=1, keepdims=True) + sizes - max(sizes)
+            odds[:, pair] = np.max(odds[:, pair], axis=1, keepdims=True)
         return np.asarray(np.mean(softmax(odds, axis=1), axis=0))
 
     def _twins(self, models: Sequence[Fitted]) -> list[list[int]]:
-        """Pairs of models that are one where nothing but a motor's balance tells the stiffness.
-
-        A loss c of the torque while the link drives leaves k and k (1 - c), the motor driving and driven; a
-        loss of c/2 both ways with a stiffness of k (1 - c/2) leaves the same. Unless they differ by more than
-        laws leave, the prior of its size decides.
-        """
+        """Pairs of models that hold twins and do not differ by more than laws leave."""
         keys = [one.keys for one in models]
         pairs = [
             [keys.index(other), k]
             for k, own in enumerate(keys)
-            for name, motor in own
-            if name == _TWINS[1] and (other := own - {(name, motor)} | {(_TWINS[0], motor)}) in keys
+            for twin in twins(models[k], self.problem)
+            if (other := own - twin.held | twin.instead) in keys
         ]
-        if not pairs or (self.problem.frames[0].linked and not self.problem.calibrating):
-            return []
         return [pair for pair in pairs if self._differ(*(models[k] for k in pair)) < 1.0]
 
     def _differ(self, one: Fitted, other: Fitted) -> float:

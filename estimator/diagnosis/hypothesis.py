@@ -78,6 +78,14 @@ class Fitted:
         )
 
     @property
+    def bends(self) -> frozenset[object]:
+        """Its curves of a deflection."""
+        own = frozenset[object](t.candidate.key for t in self.terms if t.candidate.bends)
+        extra = self.extra
+        bent = extra is not None and extra.coordinates[0] == "deflection"
+        return own | {extra} if bent else own
+
+    @property
     def families(self) -> frozenset[object]:
         """Families of its effects: what laws are for; a free curve is of none."""
         own = frozenset(t.candidate.family for t in self.terms)
@@ -93,11 +101,6 @@ class Fitted:
         off = np.array([off for slot, off in self._off() if slot.kind == "everyday"])
         effects = price * len(self.keys) + 0.5 * self.parameters * math.log(max(errors, 1.0))
         return -0.5 * float(off @ off) - effects
-
-    def log_size(self, name: str) -> float:
-        """Return the logarithm of the prior density of an effect's size, up to a constant."""
-        off = [(x, j) for j, (slot, x) in enumerate(self._off()) if (slot.kind, slot.name) == ("term", name)]
-        return -sum(0.5 * x * x + math.log(float(self.regression.std[j])) for x, j in off)
 
     def is_real_beside(self, parent: Fitted) -> bool:
         """Return whether every effect contributes, none at an end of the motion, and no spring is at zero

@@ -7,6 +7,7 @@ delays, zeros of readings) are iterated by Gauss-Newton steps.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -102,6 +103,23 @@ class Problem:
             rounded = [float(np.sqrt(np.mean(c.stiffness**2))) * angle for c, angle in pairs]
             made += rounded + [float(np.linalg.norm(np.array(rounded)[list(frame.pulls)]))] * frame.linked
         return np.hypot(choice("floor") * self.torque_rms, made)
+
+    def bent(self, fitted: Fitted) -> FloatArray:
+        """Return (groups,) what the springs' laws leave, N·m: of what they have beyond the stiffness at
+        rest, as any law, and what the joint file says that its own fit has left.
+        """
+        made: list[float] = []
+        for frame in self.at(fitted.corrections, fitted.base):
+            left = []
+            for i, law in enumerate(fitted.base.models(frame)):
+                c, known = frame.motors[i], frame.model.motors[i].fit_rms_nm or (0.0, np.inf)
+                bend = 0.0
+                if law is not None:
+                    linear = float(law.stiffness(np.zeros(1), fitted.base.alpha[i])[0]) * c.deflection
+                    bend = choice("law") * float(np.std(frame.project(c.flexibility_torque - linear)))
+                left.append(math.hypot(bend, known[0] * max(self.torque_rms / known[1], 1.0)))
+            made += left + [float(np.linalg.norm(np.array(left)[list(frame.pulls)]))] * frame.linked
+        return np.array(made)
 
     def alike(self, records: Sequence[Record]) -> Problem:
         """Return the same joint and filter with other recordings."""

@@ -252,15 +252,15 @@ class Search:
 
     def rivals(self, hypothesis: Fitted, k: int, rest: Fitted) -> list[Fitted]:
         """Return alternatives to a term beside the rest, best first; a ripple elsewhere also starts at its
-        period.
+        period, once a turn for an eccentric encoder.
         """
         own = hypothesis.terms[k]
-        grown = self.children(rest, like=own.candidate)
-        if _PERIODS in own.values:
-            here = own.candidate
+        grown, here = self.children(rest, like=own.candidate), own.candidate
+        once = {_PERIODS: 1.0} if here.kind.name == "encoder_eccentricity" else {}
+        if values := once | {name: own.values[name] for name in own.values if name == _PERIODS}:
             ripples = [e.candidate for e in self._library if _PERIODS in e.candidate.kind.nonlinear]
-            places = [c for c in ripples if c != here and c.motor == here.motor and c.key not in rest.keys]
-            moved = [self._grown(rest, Term(c, own.values)) for c in places]
+            each = [c.beside(rest.keys) for c in ripples if c != here and here.motor in (c.motor, None)]
+            moved = [self._grown(rest, Term(c, values)) for c in each if c is not None]
             grown += [child for child in moved if child.is_real_beside(rest)]
         return self.ranked([child for child in grown if child.terms[-1].candidate.key != own.candidate.key])
 

@@ -24,6 +24,7 @@ from estimator.diagnosis.probabilities import Chances, accounts, believed, chanc
 from estimator.diagnosis.result import Diagnosis, Errors, Finding, RecordingErrors, Refitted, Verdict
 from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.stiffness import stiffness_curves
+from estimator.diagnosis.twins import twins
 from estimator.effects import LIBRARY
 from estimator.priors import PRIORS
 from estimator.reasons import percent
@@ -71,11 +72,10 @@ class Judge:
         curve = best_curve(self.search, self.search.null)
         seen = [*self.search.seen, *([] if curve is None else [curve])]
         beside = accounts(self.held, self.found, seen)
-        linked, springs = self.problem.frames[0].linked, [m.transmission for m in self.problem.model.motors]
-        unknown = [i for i, own in enumerate(springs) if own.model == "polynomial" and not own.parameters]
-        chance = chances(self.found, beside, linked, unknown)
+        alike = [twin for twin in twins(self.found, self.problem) if not twin.measured]
+        chance = chances(self.found, beside, alike)
         terms = range(len(self.found.terms))
-        standings = [standing(self.found, k, beside, chance, linked, unknown) for k in terms]
+        standings = [standing(self.found, k, beside, chance, alike) for k in terms]
         effects = findings_of(self.search, self.found, standings, self.surplus)
         return self._stated(self._judged(effects, curve), beside, chance)
 
@@ -84,10 +84,13 @@ class Judge:
         judged = self._explained(effects, curve)
         if not self._harmful(judged.before, judged.after):
             return judged
-        if judged.verdict != "effect":
-            return judged._replace(after=judged.before)
-        notes = [*judged.notes, "on held-out data the effects do not lower the error: they are not written"]
-        return judged._replace(verdict="insufficient_excitation", after=judged.before, notes=notes)
+        judged = judged._replace(after=judged.before)
+        notes = [*judged.notes]
+        if judged.verdict == "effect":
+            notes.append("on held-out data the effects do not lower the error: they are not written")
+        elif not self._astray(judged.before, judged.before):
+            return judged
+        return judged._replace(verdict="insufficient_excitation", notes=notes)
 
     def _explained(self, effects: list[Finding], curve: Fitted | None) -> _Judged:
         """The verdict on the effects found, or on a free curve that explains more than they do."""
@@ -114,8 +117,11 @@ class Judge:
 
     def _harmful(self, before: Fitted, after: Fitted) -> bool:
         """Whether a model is worse on held-out data than the declared one, or than none at all."""
-        worse = self.held.squared(after) > self.held.squared(before)
-        return worse or self.held.errors(before, after).after_relative > 1.0
+        return self.held.squared(after) > self.held.squared(before) or self._astray(before, after)
+
+    def _astray(self, before: Fitted, after: Fitted) -> bool:
+        """Whether a model leaves more than the torque that is measured."""
+        return self.held.errors(before, after).after_relative > 1.0
 
     def _stamped_wrongly(self, effects: list[Finding]) -> list[str]:
         """Delays beyond those of any drive or bus, one sentence each."""

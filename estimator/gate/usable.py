@@ -83,16 +83,27 @@ def at_limit(record: Record) -> NDArray[np.int64]:
     """Return (k, 2) first and last row of stretches where a torque rests on its largest or smallest value.
 
     They are longer than what a line bridges. A drive or a recorder clips there: more may have acted. A torque
-    that is often there, as that of a motor that is switched, is as it is.
+    that is often there, as that of a motor that is switched, is as it is. So is a peak that rounding makes
+    flat: a parabola is within its next value for sqrt(2) times as long at least.
     """
     made: list[NDArray[np.int64]] = []
     for torque in record.motor_torque_nm.T:
-        at = np.stack([torque == np.max(torque), torque == np.min(torque)])
-        turns = [np.flatnonzero(np.diff(x, prepend=False, append=False)).reshape(-1, 2) for x in at]
-        runs = np.concatenate(turns) - np.array([0, 1])
-        if np.mean(at[0] | at[1]) <= choice("gaps"):
-            made.append(runs[runs[:, 1] - runs[:, 0] >= whole("bridged")])
+        often, found = 0.0, []
+        for side in (torque, -torque):
+            first, at = np.unique(side)[-2:][0], side == np.max(side)
+            often += float(np.mean(at))
+            runs, wide = _runs(at), _runs(side >= first)
+            around = wide[np.searchsorted(wide[:, 0], runs[:, 0], side="right") - 1]
+            sharp = np.ptp(around, axis=1) + 1 < np.sqrt(2.0) * (np.ptp(runs, axis=1) + 1)
+            found.append(runs[sharp & (np.ptp(runs, axis=1) >= whole("bridged"))])
+        if often <= choice("gaps"):
+            made += found
     return np.concatenate([np.zeros((0, 2), dtype=np.int64), *made])
+
+
+def _runs(true: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(k, 2) first and last row of each stretch."""
+    return np.asarray(np.flatnonzero(np.diff(true, prepend=False, append=False)).reshape(-1, 2) - [0, 1])
 
 
 def is_held(record: Record, model: JointModel) -> bool:

@@ -14,7 +14,7 @@ from drivelink.errors import JointFileError, RecordingError, UsageError
 from drivelink.jointfile import parse
 from drivelink.jointfile.columns import UNITS
 from drivelink.recording import read
-from drivelink.recording.columns import parse_column_map
+from drivelink.recording.columns import column_map, parse_column_map
 from drivelink.recording.formats import FORMATS, Format, open_sink
 
 TEXT = """\
@@ -78,7 +78,7 @@ def test_columns_of_others_are_read_in_our_names_and_units_also_in_place_of_ours
     assert np.array_equal(record.motor_position_rad[:, 0], same.link_position_rad)
     assert np.array_equal(record.link_position_rad, same.motor_position_rad[:, 0])
     assert UNITS["_rad_s"]["rpm"] * 60 == UNITS["_rad"]["rev"] == 360 * UNITS["_rad"]["deg"] == 2 * math.pi
-    assert parse_column_map(["a=b=time_s:us"])["time_s"] == ("a=b", 1e-6, True)
+    assert parse_column_map(["a=b=time_s:us"])["time_s"] == ("a=b", 1e-6, True, "us")
 
 
 def test_a_format_with_columns_is_one_entry(tmp_path, monkeypatch):
@@ -108,6 +108,25 @@ def test_a_mapping_that_cannot_be_is_one_line(text, line):
     with pytest.raises(UsageError) as caught:
         parse_column_map([text])
     assert line in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("axis", "unit", "right"),
+    [("rotary", "mm", "deg"), ("linear", "deg", "um"), ("rotary", "kN", "kNm"), ("linear", "rpm", "rad/s")],
+)
+def test_a_unit_of_the_other_axis_is_refused(axis, unit, right):
+    name = next(
+        f"motor1_{end}"
+        for end in ("position_rad", "velocity_rad_s", "torque_nm")
+        if unit in UNITS[end[end.index("_") :]]
+    )
+    joint = parse(f'axis = "{axis}"\n{TEXT}')
+    with pytest.raises(UsageError, match=f"{name}: {unit} is no unit of a {axis} axis: give the factor"):
+        column_map(joint, parse_column_map([f"x={name}:{unit}"]))
+    declared = f'[recording.columns]\n{name} = {{ name = "x", unit = "{unit}" }}\n'
+    with pytest.raises(UsageError, match="is no unit of"):
+        column_map(parse(f'axis = "{axis}"\n{TEXT}{declared}'), None)
+    assert column_map(joint, parse_column_map([f"x={name}:{right}", "i=motor1_current_a:mA"]))
 
 
 def test_what_a_mapping_asks_for_in_vain_is_one_line(tmp_path):

@@ -13,7 +13,7 @@ pytest.importorskip("foxglove", reason="needs the extra foxglove")
 
 
 async def listened(port, topic):
-    """A channel, and the first message on it."""
+    """A channel, the first message on it, and the topics that are offered."""
     import aiohttp  # takes most of a second
 
     protocol = ("foxglove.sdk.v1",)
@@ -31,7 +31,7 @@ async def listened(port, topic):
             0
         ] != 1:
             pass
-        return channels[topic], message.data
+        return channels[topic], message.data, set(channels)
 
 
 def test_estimates_come_live_over_a_websocket(tmp_path):
@@ -41,8 +41,14 @@ def test_estimates_come_live_over_a_websocket(tmp_path):
         ready(daemon)
         with process("monitor", path, "--foxglove", "--port", "0") as bridge:
             port = int(bridge.stdout.readline().rpartition(":")[2].split()[0])
-            channel, data = asyncio.run(asyncio.wait_for(listened(port, "/elbow/estimate"), 60))
-            model = asyncio.run(asyncio.wait_for(listened(port, "/elbow/model"), 20))[1]  # published long ago
+            channel, data, _ = asyncio.run(asyncio.wait_for(listened(port, "/elbow/estimate"), 60))
+            # Published long ago.
+            _, model, topics = asyncio.run(asyncio.wait_for(listened(port, "/elbow/model"), 20))
+            with process("monitor", path, "--foxglove", "--port", str(port)) as second:
+                said = second.stderr.read()
+    assert said.startswith(f"drivelink monitor: --port {port}: cannot be served: Failed to bind port")
+    assert topics >= {"/elbow/model", "/elbow/estimate"}
+    assert not topics & {"/elbow/can", "/elbow/mapping", "/elbow/joint"}  # nobody sends them
     assert json.loads(channel["schema"])["properties"]["stiffness_nm_rad"]["unit"] == "N·m/rad"
     assert struct.unpack_from("<I", data, 1) == (7,)
     estimate = json.loads(data[13:])

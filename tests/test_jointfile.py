@@ -188,7 +188,8 @@ def test_no_part_of_a_written_file_is_taken_for_a_model(written):
 
 def test_a_written_file_may_be_edited_and_that_is_said(written, caplog):
     jointfile.load(written)
-    written.write_bytes(written.read_bytes().replace(b"\n", b"\r\n"))  # by a checkout on another system
+    # By a checkout on another system, and an editor there.
+    written.write_bytes(b"\xef\xbb\xbf" + written.read_bytes().replace(b"\n", b"\r\n"))
     jointfile.load(written)
     assert not caplog.messages
     written.write_text(written.read_text().replace("500.0", "600.0"))

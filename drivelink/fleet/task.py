@@ -307,8 +307,8 @@ def recorded_time(path: Path, source: Source, joint: JointFile | None = None) ->
 
 def _first_time(path: Path, joint: JointFile | None) -> float:
     """`time_s` of the first row of a CSV; 0 if not found."""
-    names = column_map(joint, None)
     with suppress(DrivelinkError, KeyError, IndexError, StopIteration):
+        names = column_map(joint, None)
         return float(renamed(first_row(path, names), names, path.name)["time_s"][0])
     return 0.0
 

@@ -36,6 +36,14 @@ UNITS: dict[str, dict[str, float]] = {
 }
 """Accepted units with their SI values, by the ending of a column's name; a linear axis has m and N."""
 
+_LINEAR = frozenset({"m", "mm", "um", "m/s", "mm/s", "N", "mN", "kN"})
+
+
+def suits(unit: str | float, axis: str) -> bool:
+    """Return whether a unit may be of that axis; SI by our names, factors, times and currents are of both."""
+    known = unit in UNITS["_rad"] | UNITS["_rad_s"] | UNITS["_nm"]
+    return not known or unit in {"rad", "rad/s", "Nm"} or (unit in _LINEAR) == (axis == "linear")
+
 
 def si_factor(column: str, unit: str | float) -> float:
     """Return SI value of one unit of a column; a number, also as text, is a factor; "" is SI.

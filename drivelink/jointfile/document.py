@@ -153,7 +153,7 @@ def load_text(path: str | Path) -> JointText:
     """
     path = Path(path)
     try:
-        text = read_regular(path, MAX_BYTES).decode().replace("\r\n", "\n")
+        text = read_regular(path, MAX_BYTES).decode("utf-8-sig").replace("\r\n", "\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "expected UTF-8 text"
         raise JointFileError(f"{path}: cannot be read as a joint file: {reason}") from error

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from drivelink.errors import RecordingError, UsageError
 from drivelink.jointfile import JointFile
-from drivelink.jointfile.columns import COLUMNS, OF_LINK, OF_MOTOR, si_factor
+from drivelink.jointfile.columns import COLUMNS, OF_LINK, OF_MOTOR, si_factor, suits
 from drivelink.plaintext import some
 from drivelink.recording.grid import (
     Grid,
@@ -41,6 +41,7 @@ class Source(NamedTuple):
     factor: float  # SI value of its unit, with its sign
     # by `--map`: it has to be there. Else our own name is taken where the source is missing.
     asked: bool = True
+    unit: str | float = ""  # by which it was given
 
 
 ColumnMap = Mapping[str, Source]
@@ -65,19 +66,29 @@ def parse_column_map(texts: Sequence[str]) -> ColumnMap:
         if name in found:
             raise UsageError(f"--map: {name} is given twice, as {found[name].column[:80]} and {source[:80]}")
         try:
-            found[name] = Source(source.strip(), si_factor(name, unit))
+            found[name] = Source(source.strip(), si_factor(name, unit), unit=unit)
         except ValueError as error:
             raise UsageError(f"--map: {name}: {error}") from error
     return found
 
 
 def column_map(joint: JointFile | None, asked: ColumnMap | None) -> ColumnMap:
-    """Return the columns of the joint file, replaced by what `--map` asks for."""
+    """Return the columns of the joint file, replaced by what `--map` asks for.
+
+    Raises:
+        UsageError: a unit is none of the joint's axis.
+    """
     declared = joint.recording.columns if joint else {}
-    return {
-        name: Source(one.name, one.sign * si_factor(name, one.unit), asked=False)
+    found = {
+        name: Source(one.name, one.sign * si_factor(name, one.unit), asked=False, unit=one.unit)
         for name, one in declared.items()
     } | dict(asked or {})
+    for name, source in found.items():
+        if joint is not None and not suits(source.unit, joint.axis):
+            raise UsageError(
+                f"{name}: {source.unit} is no unit of a {joint.axis} axis: give the factor to SI"
+            )
+    return found
 
 
 def renamed(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,7 +15,7 @@ from xml.etree import ElementTree
 from drivelink.errors import UsageError
 from drivelink.files import write_whole
 from drivelink.jointfile import JointFile
-from drivelink.recording.messages import SCHEMA_NAMES, TOPICS, message_schema
+from drivelink.recording.messages import SCHEMA_NAMES, message_schema
 from drivelink.recording.sinks import MessageSink
 
 _COLOURS = ("#0072b2", "#9ec9e2", "#9ec9e2", "#d55e00", "#009e73")
@@ -150,18 +151,20 @@ class FoxgloveSink(MessageSink):
                 name="drivelink", host="127.0.0.1", port=port, context=context, server_listener=listener
             )
         except (OSError, RuntimeError) as error:
-            raise UsageError(f"--port {port}: cannot be served: {error}") from error
+            reason = str(error).removeprefix("FoxgloveError: ")
+            raise UsageError(f"--port {port}: cannot be served: {reason}") from error
         self.port: int = self._server.port  # where it listens
         self._newest: dict[str, tuple[int, bytes]] = {}  # documents by topic: stamp and content
-        self._channels = {}
-        for topic in TOPICS:
+
+        @cache
+        def channel(topic: str) -> Any:
             name = SCHEMA_NAMES.get(topic, f"drivelink.{topic}")
-            schema = foxglove.Schema(
-                name=name, encoding="jsonschema", data=message_schema(topic, len(joint.motor))
-            )
-            self._channels[topic] = foxglove.Channel(
-                f"/{joint.name}/{topic}", schema=schema, message_encoding="json", context=context
-            )
+            content = message_schema(topic, len(joint.motor))
+            schema = foxglove.Schema(name=name, encoding="jsonschema", data=content)
+            path = f"/{joint.name}/{topic}"
+            return foxglove.Channel(path, schema=schema, message_encoding="json", context=context)
+
+        self._channel = channel  # of a topic, offered from its first message on
 
     def on_subscribe(self, _client: object, channel: Any) -> None:
         """Send what a client has missed; foxglove-sdk calls this in a thread of its own."""
@@ -187,4 +190,4 @@ class FoxgloveSink(MessageSink):
     abandon = close
 
     def _put(self, topic: str, stamp_ns: int, data: bytes) -> None:
-        self._channels[topic].log(data, log_time=stamp_ns)
+        self._channel(topic).log(data, log_time=stamp_ns)

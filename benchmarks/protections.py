@@ -85,7 +85,7 @@ PROTECTIONS = [
         ("messages of others", "pubsub/feed.py", "if not (free and vouched):", "if False:", "tests/test_network_attacks.py -k 'stays or who_speaks'"),
         ("valid and impossible", "pubsub/wire.py", "if message.status & _VALID and not _usable(message):", "if False:", "tests/test_wire.py"),
         ("floods of queries", "pubsub/publisher.py", "zenoh.handlers.RingChannel(_QUERIES)", "zenoh.handlers.FifoChannel(10_000)", "tests/test_publisher.py -k flood"),
-        ("rows of a part", "fleet/table.py", "        if left < 0:", "        if False:", "tests/test_fleet_table.py -k stands_in_a_part"),
+        ("rows of a part", "fleet/table.py", "    if left < 0:", "    if False:", "tests/test_fleet_table.py -k stands_in_a_part"),
         ("units that another master writes", "cycle/following.py", ' else "units" if address in dict(layout.reported) else ""', ' else ""', "tests/test_read_back.py -k writes_a_unit"),
         ("findings that are told", "canopen/passive.py", "node.untold(layout.notices)", "layout.notices", "tests/test_canopen_passive.py -k fills_no_log"),
         ("frames at once", "cycle/sources.py", "while len(messages) < MOST_FRAMES and", "while len(messages) < 5000 and", "tests/test_interfaces.py -k 11_bits"),

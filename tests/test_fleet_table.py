@@ -115,6 +115,15 @@ def test_a_text_that_stands_in_a_part_once_for_all_rows_is_not_unpacked_for_all_
         read_rows(Store(str(tmp_path)))
 
 
+def test_a_part_that_says_itself_that_it_is_too_large_is_not_unpacked(tmp_path, monkeypatch):
+    """One text of 600 MB has 11 kB, and was one batch."""
+    append(tmp_path, row("a") | {"details": "x" * (2 << 20)})
+    monkeypatch.setattr(table, "_MOST_BYTES", 1 << 20)
+    monkeypatch.setattr(table, "_batches", lambda *_: pytest.fail("unpacked"))
+    with pytest.raises(FleetError, match=r"expected rows of at most 1 MiB"):
+        read_rows(Store(str(tmp_path)))
+
+
 def test_a_part_whose_texts_are_no_texts_is_one_line(tmp_path):
     append(tmp_path, row("a"))
     (part,) = tmp_path.glob("table/*.parquet")

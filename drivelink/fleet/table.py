@@ -214,9 +214,11 @@ def _read(store: Store, part: str, columns: list[str] | None = None) -> Any:
     content, where = store.read(part), f"{store.url}/{part}"
     try:
         about = pq.read_metadata(io.BytesIO(content))
-        rows = sum(about.row_group(k).num_rows for k in range(about.num_row_groups))
+        groups = [about.row_group(k) for k in range(about.num_row_groups)]
+        rows = sum(group.num_rows for group in groups)
         if not 0 <= rows <= _MOST_ROWS:
             raise FleetError(f"{where}: expected at most {_MOST_ROWS} rows, got {rows}")
+        _require_memory(_MOST_BYTES - sum(group.total_byte_size for group in groups), where)
         table = pa.Table.from_batches(_batches(content, wanted, where), wanted)
         table.validate(full=True)  # texts are UTF-8
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:  # also of UTF-8, and twice a column
@@ -229,6 +231,11 @@ def _read(store: Store, part: str, columns: list[str] | None = None) -> Any:
     return table
 
 
+def _require_memory(left: int, where: str) -> None:
+    if left < 0:
+        raise FleetError(f"{where}: expected rows of at most {_MOST_BYTES >> 20} MiB in memory, got more")
+
+
 def _batches(content: bytes, schema: Any, where: str) -> Iterator[Any]:
     """Yield some rows after the other: a text may stand in the file once for thousands of them."""
     file, left = pq.ParquetFile(pa.BufferReader(content)), _MOST_BYTES
@@ -236,8 +243,7 @@ def _batches(content: bytes, schema: Any, where: str) -> Iterator[Any]:
     columns = [name for name in schema.names if name in present]
     for batch in file.iter_batches(_AT_ONCE, columns=columns, use_threads=False):
         left -= batch.nbytes
-        if left < 0:
-            raise FleetError(f"{where}: expected rows of at most {_MOST_BYTES >> 20} MiB in memory, got more")
+        _require_memory(left, where)
         arrays = [
             batch.column(one.name).cast(one.type) if one.name in present else pa.nulls(len(batch), one.type)
             for one in schema

@@ -334,6 +334,24 @@ def test_the_table_is_data_on_the_page(report):
     assert "Content-Security-Policy" in text and "default-src 'none'" in text
 
 
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("transmission", None),
+        ("effects", None),
+        ("parameters", "{"),
+        ("covariance", [1.0, 2.0]),
+        ("details", '{"effects": [1]}'),
+    ],
+)
+def test_what_no_run_writes_into_the_table_is_one_line(column, value, tmp_path, capsys):
+    rows = [row(str(k)) | night("elbow", k, 150.0, []) | {column: value} for k in range(8)]
+    append(tmp_path, *rows)
+    assert main(["fleet", "report", str(tmp_path)]) == 3
+    error = capsys.readouterr().err
+    assert "its table has what no run of drivelink writes: " in error and error.count("\n") == 1
+
+
 def test_a_linear_axis_has_metres_and_newtons():
     rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) | {"axis": "linear"} for k in range(10)]
     text = page(summarise(rows, 0.05))

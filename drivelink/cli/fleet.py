@@ -176,13 +176,19 @@ def _report(folder: str, *, as_json: bool) -> None:
     from rich.console import Console
 
     from drivelink.fleet import page, summary, table
-    from drivelink.fleet.storage import Store
+    from drivelink.fleet.storage import FleetError, Store
     from drivelink.output.document import Lines, Section, show
 
     store = Store(folder)
-    document = summary.summarise(table.read_rows(store, summary.COLUMNS), _FALSE_SHARE)
+    rows = table.read_rows(store, summary.COLUMNS)
+    try:  # any column may hold anything: the table may be one that many write to
+        document = summary.summarise(rows, _FALSE_SHARE)
+        html = page.page(document)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        what = f"what no run of drivelink writes: {type(error).__name__}: {error}"
+        raise FleetError(f"{store.url}: its table has {what}") from error
     store.write("fleet.json", (json.dumps(document, indent=1) + "\n").encode())
-    store.write("fleet.html", page.page(document).encode())
+    store.write("fleet.html", html.encode())
     if as_json:
         print(json.dumps(document))
         return

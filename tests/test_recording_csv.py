@@ -232,6 +232,18 @@ def test_headers_of_excel_windows_and_numpy_are_read(tmp_path, start, encoding):
     assert record.link_position_rad is not None and len(record) == len(rows())
 
 
+def test_columns_apart_by_spaces_cells_of_spreadsheets_and_columns_without_a_name_are_read(tmp_path, said):
+    table, path = rows(), tmp_path / "r.csv"
+    np.savetxt(path, table, fmt="%12.9f", header=" ".join(COLUMNS))
+    assert np.allclose(read(path).motor_position_rad[:, 0], table[:, 1], atol=1e-9)
+    lines = [",".join(("", *COLUMNS)), *(",".join(map(repr, row)) for row in np.c_[:50, table].tolist())]
+    lines[20] = lines[20].rpartition(",")[0] + ",#N/A"
+    lines[21] += " # the belt slipped"
+    path.write_text("\n".join([*lines, ""]))
+    assert np.array_equal(read(path).sequence, np.delete(np.arange(50), 19))
+    assert "ignored" not in said.text
+
+
 def test_a_header_without_known_columns_is_shown_whole(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text("Zeit [ms];Position Motor 1 [°];Strom Motor 1 [mA];Drehzahl Motor 1;Winkel\n0;1;2;3;4\n")

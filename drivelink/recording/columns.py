@@ -192,7 +192,7 @@ def record_from_columns(
         RecordingError: a column is missing, or the sampling is not uniform.
     """
     columns = {**columns, **dict.fromkeys(ignored, np.empty(0))}
-    if unknown := [name for name in columns if name not in COLUMNS]:
+    if unknown := [name for name in columns if name and name not in COLUMNS]:
         _LOG.warning("%s: ignored column(s) %s", where, some(unknown, 40))
     factors = joint.recording.scale if joint else {}
     columns = {name: x * factors[name] if name in factors else x for name, x in columns.items()}

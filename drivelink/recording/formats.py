@@ -28,13 +28,13 @@ from estimator.sample import FloatArray
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_EMPTY = frozenset({"", "null", "none", "n/a", "na", "-"})  # cells without a value, in lower case
+_EMPTY = frozenset({"", "null", "none", "n/a", "#n/a", "na", "-"})  # cells without a value, in lower case
 
 
 def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     """Read the known columns (docs/reference/recordings.md); an empty cell is NaN.
 
-    Accepts comma, semicolon or tab as separator, decimal commas with the latter two, a byte-order mark,
+    Accepts comma, semicolon, tab or spaces as separator, decimal commas but with commas, a byte-order mark,
     Windows-1252, and `#` comments. A last line without end is omitted, because it may be incomplete.
 
     Args:
@@ -115,6 +115,8 @@ def _text(line: bytes) -> str:
 def _names(header: str) -> tuple[tuple[str, ...], str]:
     """Return the names in a header, and what separates them."""
     separator = max(",;\t", key=header.count)
+    if separator not in header and len(words := header.split()) > 1:
+        return tuple(words), " "
     return tuple(name.strip().strip("\"'").strip() for name in header.split(separator)), separator
 
 
@@ -136,8 +138,8 @@ def _layout(header: str, path: Path, known: frozenset[str]) -> _Layout:
 
 def _rows(file: IO[bytes], layout: _Layout, path: Path, first_line: int) -> Iterator[list[float]]:
     """The numbers of each row, of the columns that are read."""
-    lines = (line.decode(errors="replace").partition("#")[0] for line in whole_lines(file, path, first_line))
-    reader = csv.reader(lines, delimiter=layout.separator)
+    lines = map(_bare, whole_lines(file, path, first_line))
+    reader = csv.reader(lines, delimiter=layout.separator, skipinitialspace=True)
     try:
         for cells in reader:
             if len(cells) == len(layout.names):
@@ -146,6 +148,12 @@ def _rows(file: IO[bytes], layout: _Layout, path: Path, first_line: int) -> Iter
                 raise ValueError(f"expected {len(layout.names)} columns, got {len(cells)}")
     except (csv.Error, ValueError) as error:
         raise RecordingError(f"{path}: line {first_line + reader.line_num - 1}: {error}") from error
+
+
+def _bare(line: bytes) -> str:
+    """Return a row without a comment and the spaces around it; `#N/A` in a cell is none."""
+    text = line.decode(errors="replace").strip(" \r\n")
+    return "" if text.startswith("#") else text.partition(" #")[0].rstrip(" ")
 
 
 def _row(cells: list[str], layout: _Layout) -> list[float]:

@@ -444,6 +444,24 @@ def test_a_file_with_too_many_frames_is_refused_where_it_has_them(tmp_path):
         read(path, JOINT)
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("cob_id", 1 << 40), ("motor", -1), ("scale", 0.0), ("scale", math.inf), ("bits", 65), ("modulus", -1)],
+)
+def test_a_layout_that_no_node_has_is_one_line(key, value, tmp_path):
+    """Its numbers were those that the compiled core takes, or a traceback."""
+    mapped = {"signal": "other", "index": 0x6064, "subindex": 0, "bits": 32, "signed": True}
+    mapped |= {"scale": 1.0, "modulus": 0}
+    tpdo = {"cob_id": 0x181, "objects": [mapped]}
+    node = {"node_id": 1, "motor": 0, "tpdos": [tpdo]}
+    next(part for part in (mapped, tpdo, node) if key in part)[key] = value
+    path = tmp_path / "r.log"
+    path.write_text("c 080#\n")
+    side_file(path).write_text(json.dumps({"joint": "elbow", "source": "daemon", "nodes": [node]}))
+    with one_line("r.log: its mapping cannot be read"):
+        read(path, JOINT)
+
+
 def test_topics_without_end_take_no_memory(tmp_path):
     """One of 15 MiB with a character that takes four bytes in memory, and so do all others then."""
     path = mcap_of(tmp_path / "r.mcap", [("\U0001f600" + "a" * (15 << 20) + "/can", 0, b"{}")])

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import TypeAdapter
+from pydantic import AfterValidator, Field, TypeAdapter
 
 from drivelink.errors import BusError, JointFileError
 from drivelink.jointfile import BusSection, DriveSection, EncoderSection, JointFile, TpdoSection
@@ -130,6 +130,18 @@ class Signal(StrEnum):
     OTHER = "other"  # mapped by the drive, not used by us
 
 
+def _nonzero(scale: float) -> float:
+    if scale == 0.0:
+        raise ValueError("expected a scale, got 0")
+    return scale
+
+
+# What the layout in a recording may hold: `layout_from` checks it.
+_Motor = Annotated[int, Field(ge=0, le=1)]
+_Byte = Annotated[int, Field(ge=0, le=0xFF)]
+_Scale = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_nonzero)]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappedObject:
     """One object in a TPDO, or one that a node could send in one."""
@@ -137,15 +149,15 @@ class MappedObject:
     signal: Signal  # what it means
     index: int  # object index
     subindex: int  # object subindex
-    bits: int  # its length in the frame
+    bits: Annotated[int, Field(ge=0, le=64)]  # its length in the frame
     signed: bool  # whether two's complement
     # SI units at the joint side per count, direction and gear included (1 for the statusword)
-    scale: float = 1.0
+    scale: _Scale = 1.0
     wraps: bool = False  # whether the counter rolls over at its length (absolute or incremental position)
     offset: float = 0.0  # SI units, subtracted after scaling (0 but for the link encoder's zero)
     # counts after which it rolls over, where that is less than its length allows (the measuring range of an
     # absolute encoder, 0x6002 of CiA 406); 0: at its length
-    modulus: int = 0
+    modulus: Annotated[int, Field(ge=0, le=1 << 64)] = 0
 
     @property
     def address(self) -> tuple[int, int]:
@@ -157,9 +169,9 @@ class MappedObject:
 class TpdoLayout:
     """One TPDO: its identifier and the objects in it, in order from bit 0."""
 
-    cob_id: int  # identifier of the frame
+    cob_id: Annotated[int, Field(ge=0, le=0x7FF)]  # identifier of the frame
     objects: tuple[MappedObject, ...]  # what is in it
-    transmission_type: int = 1  # 1 to 240: every so many SYNCs; 254, 255: event-driven
+    transmission_type: _Byte = 1  # 1 to 240: every so many SYNCs; 254, 255: event-driven
     number: int = 0  # 1 for 0x1800/0x1A00 and so on; 0: unknown (passive)
     inhibit_s: float = 0.0  # shortest time between two frames with types 254 and 255; 0: none, or not known
 
@@ -174,7 +186,9 @@ class NodeLayout:
     """One node of a joint."""
 
     node_id: int  # 1 to 127
-    motor: int | None  # index of the motor this drive belongs to, or None for a node that is only an encoder
+    motor: (
+        _Motor | None
+    )  # index of the motor this drive belongs to, or None for a node that is only an encoder
     tpdos: tuple[TpdoLayout, ...]  # its frames that carry signals of the joint
     other_tpdos: tuple[TpdoLayout, ...] = ()  # enabled frames of this node that are not used but load the bus
     heartbeat_ms: int = 0  # period of the heartbeat the node produces, as read back; 0: none, or not known

@@ -150,6 +150,9 @@ def test_the_page_draws_live_plots_in_a_browser(web, tmp_path):
         browser.open(web.url)
         browser.wait_for("document.getElementById('stiffness').textContent === '700.0'")
         assert browser.wait_for("document.getElementById('state').textContent") == "running"
+        before = "$('state').className = '{}', getComputedStyle($('state'), '::before').content"
+        assert browser.evaluate(before.format("")) == '"daemon: "'
+        assert browser.evaluate(before.format("red")) == "none"  # "daemon gone" says it
         for width in (390, 800, 1200):  # no number reaches into the next one
             browser.resize(width, 900)
             assert browser.evaluate(WIDE) == 0

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivelink import cli
 from drivelink.errors import RecordingError
-from drivelink.jointfile import JointFile, parse
+from drivelink.jointfile import JointFile, load, parse
 from drivelink.recording import read
 from drivelink.recording.columns import parse_column_map
 from drivelink.recording.grid import NotUniformError, find_grid
@@ -274,10 +275,12 @@ def test_the_joint_says_how_many_motors_there_are(tmp_path):
     assert read(path).motors == 1
 
 
-def test_a_rigid_joint_needs_no_link_position_and_a_flexible_one_does(tmp_path):
-    path = write(tmp_path / "r.csv", rows()[:, :3], COLUMNS[:3])
-    rigid = parse(SINGLE + '[motor.transmission]\nmodel = "none"\n')
-    assert read(path, rigid).link_position_rad is None
+def test_a_rigid_joint_needs_no_link_position_and_a_flexible_one_does(tmp_path, capsys):
+    path, joint = write(tmp_path / "r.csv", rows()[:, :3], COLUMNS[:3]), tmp_path / "j.toml"
+    joint.write_text(SINGLE + '[motor.transmission]\nmodel = "none"\n')
+    assert read(path, load(joint)).link_position_rad is None
+    assert cli.main(["replay", str(path), "--joint", str(joint)]) == 0
+    assert capsys.readouterr().out.splitlines()[0].endswith("observable 0.0 %")  # it has no stiffness
     with pytest.raises(RecordingError, match="link_position_rad"):
         read(path, parse(SINGLE))
 

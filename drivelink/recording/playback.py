@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from array import array
 from collections.abc import Callable, Iterable, Iterator
@@ -296,12 +297,13 @@ class Summary:
         half = SIGMA_95 * estimate.stiffness_std_nm_rad
         missing, periods = self._missing()
         gaps = f"{missing} of {periods} samples missing, " if missing else ""
+        stiffness = with_interval(estimate.stiffness_nm_rad, half, "N·m/rad")
+        end = f"; at the end stiffness {stiffness}" if math.isfinite(estimate.stiffness_nm_rad) else ""
         return (
             f"{self.count} cycles, {gaps}{seconds:.6g} s, in {took_s:.3g} s "
             f"({seconds / max(took_s, 1e-9):.3g} × real time); "
             f"valid {100 * self.valid / self.count:.1f} %, "
-            f"observable {100 * self.observable / self.count:.1f} %; at the end stiffness "
-            f"{with_interval(estimate.stiffness_nm_rad, half, 'N·m/rad')}"
+            f"observable {100 * self.observable / self.count:.1f} %{end}"
         )
 
     def _missing(self) -> tuple[int, int]:

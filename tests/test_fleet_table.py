@@ -115,6 +115,12 @@ def test_a_text_that_stands_in_a_part_once_for_all_rows_is_not_unpacked_for_all_
         read_rows(Store(str(tmp_path)))
 
 
+def test_what_cannot_be_written_is_named_once(tmp_path):
+    (tmp_path / "folder").touch()
+    with pytest.raises(FleetError, match=r"folder/a/b: cannot be written: [^/]+$"):
+        Store(str(tmp_path)).write("folder/a/b", b"")
+
+
 def test_a_part_that_says_itself_that_it_is_too_large_is_not_unpacked(tmp_path, monkeypatch):
     """One text of 600 MB has 11 kB, and was one batch."""
     append(tmp_path, row("a") | {"details": "x" * (2 << 20)})

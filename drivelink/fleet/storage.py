@@ -143,7 +143,8 @@ def _url(pattern: str, fs: Any, path: str) -> str:
 
 
 def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    text = getattr(error, "strerror", None) or error  # without the name, which `what` has
+    return " ".join(str(text).split()) or type(error).__name__
 
 
 @contextmanager

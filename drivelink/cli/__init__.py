@@ -8,6 +8,7 @@ that a user can cause ends here as one line on stderr and its exit status.
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import json
 import logging
@@ -178,7 +179,9 @@ def _main(argv: list[str] | None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
+        # What is written to a file names it: without a name it is what was printed.
+        place = error.filename or ("standard output" if error.errno == errno.ENOSPC else "")
+        where = f"{place}: " if place else ""
         return _fail(verb, f"{where}{error.strerror or error}", 1)
 
 

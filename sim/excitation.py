@@ -143,7 +143,7 @@ def _played(
         time, columns = table["time_s"], [table[name] for name in names]
     except (OSError, ValueError, IndexError) as error:
         expected = f"a CSV file with the columns time_s, {', '.join(names)}"
-        raise SimError(f"{where}.file: {path}: expected {expected}: {error}") from error
+        raise SimError(f"{where}.file: {path}: expected {expected}") from error
     if f"motor{motors + 1}_position_rad" in (table.dtype.names or ()):
         raise SimError(f"{where}.file: {path}: has more motors than the joint, which has {motors}")
     if len(time) < 2 or not np.all(np.isfinite([time, *columns])) or not np.all(np.diff(time) > 0.0):

@@ -137,11 +137,12 @@ def test_what_is_wrong_is_one_line(tmp_path, capsys):
     asked = ["diagnose", str(tmp_path / "run.csv"), "--joint", str(joint)]
     assert cli.main([*asked, "--motion", "next.txt"]) == 2
     assert cli.main([*asked, "--motion", "next.csv", "--motion-seconds", "1"]) == 2
-    (tmp_path / "short.csv").write_text("time_s\n0\n")
+    (tmp_path / "short.csv").write_text("time_s,x\n0\n")
     assert cli.main(["sim", str(joint), "--motion", str(tmp_path / "short.csv"), "--seconds", "1"]) != 0
     assert cli.main(["sim", str(joint), "--motion", str(tmp_path / "no.csv"), "--seconds", "1"]) == 2
     joint.write_text(joint.read_text().replace("[-0.6, 0.6]", "[0.6, -0.6]"))
     assert cli.main(asked) != 0
     errors = capsys.readouterr().err.strip().splitlines()
-    assert len(errors) == 5 and "--motion: " in errors[3]
+    assert len(errors) == 5 and "no.csv: no such file" in errors[3]
     assert "[lowest, highest]" in errors[4] and "columns time_s" in errors[2]
+    assert errors[2].endswith("motor1_velocity_rad_s")  # and not what numpy says of each line

@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
 def _moving(joint: JointFile, motion: Path) -> JointFile:
     """Return the joint with a simulation whose motors follow a motion."""
     if not motion.is_file():
-        raise UsageError(f"--motion: {motion}: expected a CSV file of drivelink diagnose --motion")
+        raise UsageError(f"--motion: {motion}: no such file: diagnose --motion writes one")
     table = {"kind": "motion", "file": str(motion.absolute())}
     section = (joint.sim or SimSection()).model_copy(update={"excitation": table})
     return joint.model_copy(update={"sim": section})

@@ -80,6 +80,20 @@ def test_a_drive_that_takes_the_start_and_does_not_run_is_said_once(made):
     assert made.status["conditions"] == []
 
 
+def test_a_node_that_could_not_be_configured_and_goes_on_as_it_was_is_no_lasting_problem(made):
+    heartbeat = made.node(2).heartbeat
+    heartbeat._period.value = 0
+    heartbeat.restart()
+    made.faults.refuse_sdo(made.node(2), 0x08000022, 10_000)
+    made.run(4000 + ENOUGH)
+    made.faults.refuse_sdo(made.node(2), 0x08000022, 0)
+    assert any("node 2 cannot be configured" in text for text in made.events)
+    assert made.run(1)[0].status & Status.VALID
+    assert not any("cannot be configured" in text for text in made.status["conditions"])
+    made.faults.reboot(made.node(2))
+    back(made)
+
+
 @pytest.mark.parametrize("able", [True, False])
 def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(made, able, monkeypatch):
     """As one in whose place another device with its number was configured."""

@@ -216,6 +216,7 @@ class Supervisor:
             watched.received, watched.seen_ns = counters.received, now
             watched.started = False
             self._of(node).end(f"start {node}", f"node {node} sends its frames")
+            self._of(node).end(f"configure {node}")  # or somebody else has started it, as it was
         lost = now - watched.seen_ns > _SILENT_NS or node in assembler.untrusted
         lost = lost or (watched.state != OPERATIONAL and now - watched.heartbeat_ns < _NS)
         # Frames without the heartbeat: another device may have been configured in its place. Asked for once.

@@ -42,10 +42,9 @@ class Term:
 
     @property
     def free(self) -> list[str]:
-        """Nonlinear parameters that are fitted; once a turn is once a turn."""
+        """Nonlinear parameters that are fitted."""
         law = ("exponent", "shape") if self.values.get("exponent", 1.0) >= STOP_EXPONENT else ()
-        once = ("periods_per_rev",) if self.values.get("periods_per_rev") == 1.0 else ()
-        return [name for name in self.values if name not in ("side", "power", *law, *once)]
+        return [name for name in self.values if name not in ("side", "power", *law)]
 
 
 class Extra(NamedTuple):

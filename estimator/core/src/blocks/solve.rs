@@ -10,7 +10,7 @@ use crate::gram::{
 use crate::laws::{Law, PARAMETERS};
 use crate::spring::Projection;
 use crate::unknowns::{
-    ACTIVE, CANDIDATES, CLIPS, DRY, ECCENTRIC, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO,
+    ACTIVE, CANDIDATES, CLIPS, DRY, ECCENTRIC, LOAD, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO,
 };
 
 pub(super) const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
@@ -272,6 +272,10 @@ impl Blocks {
             groups[CANDIDATES.len() + i] = terms;
             groups[ALONE + i] = if corner == 0 { 0 } else { terms | corner };
         }
+        if self.lost && self.spring.is_constant() {
+            // What depends on where the zero is says nothing while no motion tells.
+            groups.iter_mut().filter(|group| **group & !anywhere() != 0).for_each(|group| *group = 0);
+        }
         (base, groups)
     }
 
@@ -353,6 +357,11 @@ impl Blocks {
         let open = spring.law.is_polynomial() && !spring.is_anchored() && !straight;
         !open || 2.0 * moved.abs() < high.min(-low)
     }
+}
+
+/// Unknowns that are the same wherever the zero is.
+fn anywhere() -> Set {
+    set(1..SPRING.start + 1) | set(ZERO..LOAD.start) | set(RATE..CLIPS.start) | set(ECCENTRIC)
 }
 
 /// Unknowns whose shapes no joint has quite: friction, memory, the free curve.

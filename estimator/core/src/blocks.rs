@@ -12,12 +12,12 @@ use serde::{Deserialize, Serialize};
 use crate::balance;
 use crate::causes::{Noise, Odds};
 use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, TAILS};
-use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, inverse};
+use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, inverse, set};
 use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection};
 use crate::student::f_quantile;
-use crate::unknowns::{ACTIVE, Spring};
+use crate::unknowns::{ACTIVE, SPRING, Spring};
 
 /// What a block did.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,6 +45,10 @@ struct Carried {
 }
 
 impl Carried {
+    fn knows_spring(&self) -> bool {
+        self.set & set(SPRING) != 0
+    }
+
     /// The others are open.
     fn keep(&mut self, kept: Set) {
         let covariance = inverse(&self.precision, self.set);

@@ -154,6 +154,11 @@ impl Spring {
         self.anchored = false;
     }
 
+    /// It may be any that the file declares: what has been learned is no measure any more.
+    pub fn forget(&mut self) {
+        self.anchored = self.declared;
+    }
+
     /// Whether the file says about what it is.
     #[must_use]
     pub fn is_anchored(&self) -> bool {

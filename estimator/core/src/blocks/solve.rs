@@ -1,6 +1,6 @@
 //! The unknowns of one motor's balance from the sum of its blocks: prior, noise, choice.
 
-use super::Blocks;
+use super::{Blocks, Carried};
 use crate::balance;
 use crate::choices::{ACCUSED, EXACT, FEWEST, REACHED, SURE};
 use crate::gram::{
@@ -10,10 +10,11 @@ use crate::gram::{
 use crate::laws::{Law, PARAMETERS};
 use crate::spring::Projection;
 use crate::unknowns::{
-    ACTIVE, CANDIDATES, CLIPS, DRY, ECCENTRIC, LOAD, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO,
+    ACTIVE, CANDIDATES, CLIPS, DRY, ECCENTRIC, INERTIA, LOAD, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO,
 };
 
 pub(super) const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
+const TRIED: usize = 2 * ZEROS as usize + 1;
 const WIDE: f64 = 1e6; // of a prior that says nothing
 const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
 
@@ -27,9 +28,21 @@ impl Blocks {
     }
 
     fn prior_of(&self, spring: &Spring, total: &Gram, frame: &Frame, zero_std: f64) -> Prior {
+        self.prior_after(self.carried.as_ref(), spring, total, frame, zero_std)
+    }
+
+    /// By what was known before.
+    fn prior_after(
+        &self,
+        before: Option<&Carried>,
+        spring: &Spring,
+        total: &Gram,
+        frame: &Frame,
+        zero_std: f64,
+    ) -> Prior {
         let scale = Scale { zero_std, deflection: self.deflection, period_s: self.period };
         let mut prior = spring.prior(&self.motor, &self.priors, total, frame, &scale);
-        let Some(carried) = &self.carried else { return prior };
+        let Some(carried) = before else { return prior };
         for i in unknowns(carried.set) {
             prior.precision[i] = carried.precision[i];
             prior.mean[i] = carried.x[i];
@@ -89,25 +102,37 @@ impl Blocks {
         }
     }
 
-    /// Where a lost zero is by evidence: linearised in steps over the deflections that the joint has had; `None`: all that
-    /// explain the rows do not agree.
-    fn locate(&self, total: &Gram, noise: f64) -> Option<f64> {
-        let (carried, [low, high]) = (self.carried.as_ref()?, self.seen);
+    /// How well a lost zero at each of some places explains the rows, by what was known before and linearised there, and
+    /// where it is then.
+    fn tried(&self, before: &Carried, spring: &Spring, total: &Gram, step: f64) -> [(f64, f64); TRIED] {
+        let ([low, high], mut tried) = (self.seen, spring.clone());
         let projection = Projection::between(&self.family, self.deflection, low, high);
-        let mut tried = self.spring.clone();
-        let step = carried.deflection.max(high - low) / f64::from(ZEROS);
-        let found: [(f64, f64); 2 * ZEROS as usize + 1] = std::array::from_fn(|k| {
+        std::array::from_fn(|k| {
             tried.zero = step * (k as f64 - f64::from(ZEROS));
             let nothing = (f64::NEG_INFINITY, tried.zero);
             if (tried.zero + low).abs().max((tried.zero + high).abs()) > REACHED * tried.reach() {
                 return nothing;
             }
             let frame = tried.frame(&projection);
-            let prior = self.prior_of(&tried, total, &frame, self.deflection);
-            let reduced = frame.reduce(total);
-            solve(&reduced, frame.set & ACTIVE, &prior, noise)
+            let prior = self.prior_after(Some(before), &tried, total, &frame, self.deflection);
+            let noise = self.noise.variance * self.correlated;
+            solve(&frame.reduce(total), frame.set & ACTIVE, &prior, noise)
                 .map_or(nothing, |one| (one.log_evidence, tried.zero + one.x[ZERO]))
-        });
+        })
+    }
+
+    /// Where a lost zero is; `None`: all that explain the rows do not agree, be the joint as it was or another one.
+    fn locate(&self, total: &Gram) -> Option<f64> {
+        let (before, [low, high]) = (self.carried.as_ref()?, self.seen);
+        let step = before.deflection.max(high - low) / f64::from(ZEROS);
+        let mut found = [[(f64::NEG_INFINITY, 0.0); TRIED]; 2];
+        found[0] = self.tried(before, &self.spring, total, step);
+        if before.knows_spring() {
+            let (other, spring) = self.another(before);
+            found[1] = self.tried(&other, &spring, total, step);
+            found[1].iter_mut().for_each(|one| one.0 -= rarity());
+        }
+        let found = found.as_flattened();
         let best = found.iter().copied().max_by(|a, b| a.0.total_cmp(&b.0))?;
         let rival = |one: &(f64, f64)| (one.1 - best.1).abs() > 2.0 * step && one.0 > best.0 - ACCUSED.ln();
         (best.0.is_finite() && !found.iter().any(rival)).then_some(best.1)
@@ -118,7 +143,7 @@ impl Blocks {
         if !self.lost || self.located || self.carried.is_none() || self.spring.is_constant() {
             return true;
         }
-        let Some(zero) = self.locate(total, self.noise.variance * self.correlated) else { return false };
+        let Some(zero) = self.locate(total) else { return false };
         self.located = true;
         if zero.abs() > self.deflection / f64::from(ZEROS) {
             self.off = zero;
@@ -167,12 +192,16 @@ impl Blocks {
         for step in 0..STEPS {
             let frame = self.spring.frame(&projection);
             let reduced = frame.reduce_noisy(&total, &of_columns);
-            let prior = self.prior(&total, &frame, zero);
+            let mut prior = self.prior(&total, &frame, zero);
             if step == 0 {
                 let elsewhere = self.prior(&total, &frame, self.deflection);
                 self.measure(&frame, &reduced, &elsewhere, &total);
             }
             let noise = self.noise.variance * self.noise.correlated;
+            if let Some((other, spring)) = self.anew(&frame, &reduced, &total, &prior, noise) {
+                (self.carried, self.spring) = (Some(other), spring);
+                prior = self.prior(&total, &frame, zero);
+            }
             let Some((mut chosen, moved)) = self.choose(&frame, &reduced, &total, &prior, noise) else {
                 return;
             };
@@ -288,27 +317,17 @@ impl Blocks {
         prior: &Prior,
         noise: f64,
     ) -> Option<(Posterior, bool)> {
-        let (base, mut groups) = self.groups(frame);
-        let many = self.ring.len() >= FEWEST;
-        if !many {
-            // Few rows show noise as effects; powers are one of a line.
-            let effects = if self.spring.is_line() { groups.len() } else { CANDIDATES.len() };
-            groups[..effects].fill(0);
-        }
+        let (base, mut groups) = self.offered(frame);
         let found = self.chosen(reduced, base, &groups, prior, noise)?;
-        if many && !self.lost && frame.set >> ZERO & 1 == 1 {
+        if self.ring.len() >= FEWEST && !self.lost && frame.set >> ZERO & 1 == 1 {
             // The zero is where it is declared, or anywhere in the range: then it makes the constant torque.
             let elsewhere = self.prior(total, frame, self.deflection);
             groups[ALONE - 1..].fill(0); // a corner is at the declared zero
             let constant = set(OFFSET..DRY);
             let instead = self.chosen(reduced, base & !constant, &groups, &elsewhere, noise)?;
-            let effects = |found: &Posterior| {
-                CANDIDATES.iter().filter(|one| set(one.unknowns.clone()) & found.set != 0).count() as f64
-            };
-            let more = 1.0 + effects(&instead) - effects(&found);
             let bare = log_evidence(reduced, found.set & !constant, prior, noise);
             let odds = instead.log_evidence - found.log_evidence.max(bare);
-            if odds > more * (groups.len() as f64).ln() {
+            if odds > self.rarer(&instead, &found) {
                 let other = solve(reduced, instead.set | constant, &elsewhere, noise)?;
                 if self.is_seen(&other) {
                     return Some((other, true));
@@ -316,6 +335,52 @@ impl Blocks {
             }
         }
         Some((found, false))
+    }
+
+    /// The same as far as so many blocks can tell: few rows show noise as effects; powers are one of a line.
+    fn offered(&self, frame: &Frame) -> (Set, Groups) {
+        let (base, mut groups) = self.groups(frame);
+        if self.ring.len() < FEWEST {
+            let effects = if self.spring.is_line() { groups.len() } else { CANDIDATES.len() };
+            groups[..effects].fill(0);
+        }
+        (base, groups)
+    }
+
+    /// By how much rarer one explanation with a further cause is than another, before any data: ln of the odds.
+    fn rarer(&self, instead: &Posterior, found: &Posterior) -> f64 {
+        let effects = |of: &Posterior| {
+            let chosen = CANDIDATES.iter().filter(|one| set(one.unknowns.clone()) & of.set != 0).count();
+            chosen as f64 + f64::from(self.spring.is_longer(of.set))
+        };
+        (1.0 + effects(instead) - effects(found)) * rarity()
+    }
+
+    /// The joint after a restart as another one, where that explains the rows better than what was known before.
+    fn anew(
+        &self,
+        frame: &Frame,
+        reduced: &Reduced,
+        total: &Gram,
+        prior: &Prior,
+        noise: f64,
+    ) -> Option<(Carried, Spring)> {
+        let before = self.carried.as_ref().filter(|before| self.lost && before.knows_spring())?;
+        let (other, spring) = self.another(before);
+        let open = self.prior_after(Some(&other), &spring, total, frame, self.deflection);
+        let (base, groups) = self.offered(frame);
+        let found = self.chosen(reduced, base, &groups, prior, noise)?;
+        let instead = self.chosen(reduced, base, &groups, &open, noise)?;
+        let odds = instead.log_evidence - found.log_evidence;
+        (odds > self.rarer(&instead, &found)).then_some((other, spring))
+    }
+
+    /// Of what was known before, what another joint with this motor has in common with it.
+    fn another(&self, before: &Carried) -> (Carried, Spring) {
+        let (mut other, mut spring) = (before.clone(), self.spring.clone());
+        other.keep(1 << INERTIA | 1 << OFFSET);
+        spring.forget();
+        (other, spring)
     }
 
     /// The unknowns of these groups that evidence chooses.
@@ -357,6 +422,11 @@ impl Blocks {
         let open = spring.law.is_polynomial() && !spring.is_anchored() && !straight;
         !open || 2.0 * moved.abs() < high.min(-low)
     }
+}
+
+/// ln of the odds against a further cause before any data: as many are held against one another.
+fn rarity() -> f64 {
+    (Groups::default().len() as f64).ln()
 }
 
 /// Unknowns that are the same wherever the zero is.

@@ -182,6 +182,7 @@ impl Blocks {
     /// The zero was located wrongly. Where that happens again, the joint is not what was known of it before: all but its
     /// motor's inertia and the torque's zero is learned anew.
     pub(super) fn miss_zero(&mut self) {
+        if std::env::var("DBG").is_ok() { eprintln!("MISS {} unexplained {} usual {} n {} doubted {}", self.missed, self.unexplained, self.usual_unexplained(), self.ring.len(), self.doubted); }
         self.missed += 1;
         if self.missed >= CONVINCING {
             self.spring.reset();

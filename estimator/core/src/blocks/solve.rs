@@ -106,6 +106,8 @@ impl Blocks {
     /// where it is then.
     fn tried(&self, before: &Carried, spring: &Spring, total: &Gram, step: f64) -> [(f64, f64); TRIED] {
         let ([low, high], mut tried) = (self.seen, spring.clone());
+        let powers = set(SPRING.start..SPRING.start + spring.least) | self.carried.as_ref().map_or(0, |one| one.set);
+        let asked = ACTIVE & !(set(SPRING) & !powers);
         let projection = Projection::between(&self.family, self.deflection, low, high);
         std::array::from_fn(|k| {
             tried.zero = step * (k as f64 - f64::from(ZEROS));
@@ -116,7 +118,7 @@ impl Blocks {
             let frame = tried.frame(&projection);
             let prior = self.prior_after(Some(before), &tried, total, &frame, self.deflection);
             let noise = self.noise.variance * self.correlated;
-            solve(&frame.reduce(total), frame.set & ACTIVE, &prior, noise)
+            solve(&frame.reduce(total), frame.set & asked, &prior, noise)
                 .map_or(nothing, |one| (one.log_evidence, tried.zero + one.x[ZERO]))
         })
     }
@@ -134,6 +136,7 @@ impl Blocks {
         }
         let found = found.as_flattened();
         let best = found.iter().copied().max_by(|a, b| a.0.total_cmp(&b.0))?;
+        if std::env::var("DBG").is_ok() { eprintln!("LOC n {} size {:.4} seen {:?} best {:?} other best {:?} own {:.3e} noise {:.3e}", self.ring.len(), self.deflection, self.seen, best, found[TRIED..].iter().copied().max_by(|a, b| a.0.total_cmp(&b.0)), self.own, self.noise.variance); }
         let rival = |one: &(f64, f64)| (one.1 - best.1).abs() > 2.0 * step && one.0 > best.0 - ACCUSED.ln();
         (best.0.is_finite() && !found.iter().any(rival)).then_some(best.1)
     }

@@ -108,7 +108,6 @@ pub struct Blocks {
     settle: u32,
     fitted: bool,  // what the file knows has been held against a block
     lost: bool,    // the zero: it may be anywhere, but for what motion shows
-    missed: usize, // times that what was known before has located it wrongly
     frame: Option<Frame>,
     #[serde(with = "crate::snapshot::array")]
     residual: Row,
@@ -178,7 +177,6 @@ impl Blocks {
             settle,
             fitted: false,
             lost: false,
-            missed: 0,
             frame: None,
             residual: [0.0; crate::gram::COLUMNS],
             odds: None,
@@ -198,7 +196,7 @@ impl Blocks {
     pub fn clear(&mut self) {
         self.spring.reset();
         self.forget_rows();
-        (self.carried, self.lost, self.missed) = (None, false, 0);
+        (self.carried, self.lost) = (None, false);
     }
 
     /// Forget rows and what they have taught: they are of other moments. A lost zero stays lost.
@@ -306,7 +304,7 @@ impl Blocks {
         self.end_doubt();
         self.solve();
         if self.lost && self.located && self.off == 0.0 && !self.is_explained() {
-            self.miss_zero();
+            self.lose_zero();
         }
         Closed::Added
     }

@@ -7,7 +7,7 @@ use crate::causes::{Cause, Known, Noise, Odds, TABLE};
 use crate::choices::{BLOCKS, CONVINCING, DRIFTED, EVEN, FEWEST, REST, UNUSUAL};
 use crate::gram::{Gram, Set, UNKNOWNS, inverse, set};
 use crate::spring::TERMS;
-use crate::unknowns::{ASYMMETRY, CORNER, DAMPING, INERTIA, OFFSET, SPRING, ZERO};
+use crate::unknowns::{ASYMMETRY, CORNER, DAMPING, INERTIA, SPRING, ZERO};
 
 impl Blocks {
     /// Something has changed: rows are of use again when the filters have forgotten what was before.
@@ -121,7 +121,7 @@ impl Blocks {
             return Closed::Begun;
         }
         if self.lost && self.doubted >= FEWEST {
-            self.miss_zero();
+            self.lose_zero();
             return Closed::Unexplained;
         }
         if self.doubted >= BLOCKS {
@@ -179,19 +179,6 @@ impl Blocks {
         self.suspected = true;
     }
 
-    /// The zero was located wrongly. Where that happens again, the joint is not what was known of it before: all but its
-    /// motor's inertia and the torque's zero is learned anew.
-    pub(super) fn miss_zero(&mut self) {
-        if std::env::var("DBG").is_ok() { eprintln!("MISS {} unexplained {} usual {} n {} doubted {}", self.missed, self.unexplained, self.usual_unexplained(), self.ring.len(), self.doubted); }
-        self.missed += 1;
-        if self.missed >= CONVINCING {
-            self.spring.reset();
-            (self.posterior, self.missed) = (None, 0);
-            self.carried.iter_mut().for_each(|carried| carried.keep(1 << INERTIA | 1 << OFFSET));
-        }
-        self.lose_zero();
-    }
-
     /// Where the zero between the encoders is, is not known any more.
     pub fn lose_zero(&mut self) {
         let found = self.located && !self.doubting && !self.is_unconfirmed() && self.is_explained();
@@ -205,7 +192,6 @@ impl Blocks {
         } else {
             self.carry_over(1 << ZERO | set(CORNER.start..ASYMMETRY.end));
         }
-        self.missed = if found { 0 } else { self.missed };
         let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
         self.forget_rows();
         (self.carried, self.lost, self.posterior, self.located) = (carried, true, None, false);

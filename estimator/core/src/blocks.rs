@@ -274,7 +274,8 @@ impl Blocks {
     /// Whether enough is known to hold rows against it.
     #[must_use]
     pub fn is_reference(&self) -> bool {
-        self.frame.is_some() && (self.ring.len() >= FEWEST || self.carried.is_some() || self.fitted)
+        let before = self.carried.as_ref().is_some_and(|carried| !self.lost || carried.knows_spring());
+        self.frame.is_some() && (self.ring.len() >= FEWEST || before || self.fitted)
     }
 
     fn close(&mut self, block: Gram) -> Closed {

@@ -1,10 +1,10 @@
 //! Blocks that what is known does not explain: has the joint changed, or a reading, or the zero?
 
-use super::solve::ZEROS;
+use super::solve::{ZEROS, anywhere};
 use super::{Blocks, Carried, Closed};
 use crate::balance;
 use crate::causes::{Cause, Known, Noise, Odds, TABLE};
-use crate::choices::{BLOCKS, CONVINCING, DRIFTED, EVEN, FEWEST, REST, UNUSUAL};
+use crate::choices::{BLOCKS, CONVINCING, DRIFTED, EVEN, FEWEST, REST, UNUSUAL, USEFUL};
 use crate::gram::{Gram, Set, UNKNOWNS, inverse, set};
 use crate::spring::TERMS;
 use crate::unknowns::{ASYMMETRY, CORNER, DAMPING, INERTIA, SPRING, ZERO};
@@ -182,6 +182,7 @@ impl Blocks {
     /// Where the zero between the encoders is, is not known any more.
     pub fn lose_zero(&mut self) {
         let found = self.located && !self.doubting && !self.is_unconfirmed() && self.is_explained();
+        let guessed = self.zero_torque(self.spring.curve(0.0).1) > USEFUL * self.torque;
         if self.are_few() && self.carried.is_none() {
             self.spring.reset(); // a few blocks have taught nothing: their zero may have been another one, too
         } else if let Some(carried) =
@@ -190,7 +191,12 @@ impl Blocks {
             // What was learned without a zero may be of another one: as it was before.
             self.spring.alpha[..TERMS].copy_from_slice(&carried.x[SPRING]);
         } else {
-            self.carry_over(1 << ZERO | set(CORNER.start..ASYMMETRY.end));
+            self.carry_over(1 << ZERO | !(anywhere() | set(SPRING)));
+            if guessed {
+                // What was learned by a zero that was another one is of another spring.
+                self.carried.iter_mut().for_each(|carried| carried.keep(1 << INERTIA));
+                self.spring.reset();
+            }
         }
         let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
         self.forget_rows();

@@ -433,7 +433,7 @@ fn rarity() -> f64 {
 }
 
 /// Unknowns that are the same wherever the zero is.
-fn anywhere() -> Set {
+pub(super) fn anywhere() -> Set {
     set(1..SPRING.start + 1) | set(ZERO..LOAD.start) | set(RATE..CLIPS.start) | set(ECCENTRIC)
 }
 

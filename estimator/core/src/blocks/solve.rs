@@ -143,7 +143,11 @@ impl Blocks {
 
     /// Whether the balance can be linearised where its zero is.
     fn is_located(&mut self, total: &Gram) -> bool {
-        if !self.lost || self.located || self.carried.is_none() || self.spring.is_constant() {
+        if !self.lost || self.located || self.spring.is_constant() {
+            return true;
+        }
+        if self.carried.is_none() {
+            self.located = true; // near where deflections are counted from, or sought again
             return true;
         }
         let Some(zero) = self.locate(total) else { return false };

@@ -81,12 +81,12 @@ def motion(
         return _begun(name, seed, bits, noise).first(seconds)
     world = _world(name, seed, excitation, bits, noise, effects)
     if step is None:
-        return _moved(record(world, seconds))
+        return moved(record(world, seconds))
     before = record(world, step[0])
     world.advance()
     world.alter(plant=_stiffer(case(name).plant, step[1]))
     after = record(world, seconds - step[0])
-    return _moved({name: np.concatenate([before[name], after[name]]) for name in before})
+    return moved({name: np.concatenate([before[name], after[name]]) for name in before})
 
 
 class _Begun:
@@ -101,7 +101,7 @@ class _Begun:
         if more > 0:
             if samples:
                 self.world.advance()
-            found, *others = _moved(record(self.world, more * PERIOD_S))
+            found, *others = moved(record(self.world, more * PERIOD_S))
             samples = samples + [s._replace(sequence=k) for k, s in enumerate(found, len(samples))]
             columns = [np.concatenate(pair) for pair in zip(columns, others, strict=True)]
             self.motion = Motion(samples, *columns)
@@ -133,7 +133,7 @@ def _world(
     return replace(given, drives=drives, encoder=encoder).world(excitation=rich, effects=effects, seed=seed)
 
 
-def _moved(rows: Mapping[str, np.ndarray]) -> Motion:
+def moved(rows: Mapping[str, np.ndarray]) -> Motion:
     """The columns as samples, with the truth beside them."""
     motors = [
         name.removesuffix("_position_rad") for name in rows if re.fullmatch("motor._position_rad", name)

@@ -1,5 +1,6 @@
 //! What one motor's balance has taught: blocks of rows, and the algebra on their sum.
 
+mod before;
 mod changes;
 mod family;
 mod interval;
@@ -9,15 +10,17 @@ mod solve;
 
 use serde::{Deserialize, Serialize};
 
+use before::Before;
+
 use crate::balance;
 use crate::causes::{Noise, Odds};
 use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, TAILS};
-use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, inverse, set};
+use crate::gram::{Frame, Gram, Posterior, Row, Vector, inverse};
 use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection};
 use crate::student::f_quantile;
-use crate::unknowns::{ACTIVE, SPRING, Spring};
+use crate::unknowns::{ACTIVE, Spring};
 
 /// What a block did.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,29 +35,6 @@ pub enum Closed {
     Lost,
     /// What follows is learned with other functions.
     Reformed,
-}
-
-/// What was known when the sum began anew, α and the zero as they are.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-struct Carried {
-    x: Vector,
-    precision: [Vector; UNKNOWNS],
-    set: Set,
-    deflection: f64, // the largest, until then
-    unexplained: f64,
-}
-
-impl Carried {
-    fn knows_spring(&self) -> bool {
-        self.set & set(SPRING) != 0
-    }
-
-    /// The others are open.
-    fn keep(&mut self, kept: Set) {
-        let covariance = inverse(&self.precision, self.set);
-        self.set &= kept;
-        self.precision = inverse(&covariance, self.set);
-    }
 }
 
 /// How noisy readings are.
@@ -86,7 +66,7 @@ pub struct Blocks {
     oldest: usize,
     waiting: Vec<Gram>,
     scores: Vec<Vector>,
-    carried: Option<Carried>,
+    before: Option<Before>,
     /// The law and its parameters.
     pub spring: Spring,
     projection: Option<Projection>,
@@ -106,8 +86,8 @@ pub struct Blocks {
     suspected: bool, // the zero, of being elsewhere since a restart
     skipped: u32,    // rows that are still of what was before
     settle: u32,
-    fitted: bool,  // what the file knows has been held against a block
-    lost: bool,    // the zero: it may be anywhere, but for what motion shows
+    fitted: bool, // what the file knows has been held against a block
+    lost: bool,   // the zero: it may be anywhere, but for what motion shows
     frame: Option<Frame>,
     #[serde(with = "crate::snapshot::array")]
     residual: Row,
@@ -157,7 +137,7 @@ impl Blocks {
             oldest: 0,
             waiting: Vec::with_capacity(FEWEST),
             scores: Vec::with_capacity(BLOCKS),
-            carried: None,
+            before: None,
             projection: None,
             deflection: 0.0,
             noise: Noise { variance: f64::NAN, correlated, tails: TAILS },
@@ -196,7 +176,7 @@ impl Blocks {
     pub fn clear(&mut self) {
         self.spring.reset();
         self.forget_rows();
-        (self.carried, self.lost) = (None, false);
+        (self.before, self.lost) = (None, false);
     }
 
     /// Forget rows and what they have taught: they are of other moments. A lost zero stays lost.
@@ -260,7 +240,7 @@ impl Blocks {
     /// Whether fewer blocks than an interval needs are all that tells of the spring, or of a lost zero.
     #[must_use]
     pub fn is_unconfirmed(&self) -> bool {
-        let nothing_before = self.carried.is_none() && !self.spring.is_anchored();
+        let nothing_before = self.before.is_none() && !self.spring.is_anchored();
         !self.lost && !self.located
             || self.ring.len() < FEWEST && (nothing_before || self.lost && !self.spring.is_constant())
     }
@@ -274,7 +254,7 @@ impl Blocks {
     /// Whether enough is known to hold rows against it.
     #[must_use]
     pub fn is_reference(&self) -> bool {
-        let before = self.carried.as_ref().is_some_and(|carried| !self.lost || carried.knows_spring());
+        let before = self.before.as_ref().is_some_and(|before| !self.lost || before.knows_spring());
         self.frame.is_some() && (self.ring.len() >= FEWEST || before || self.fitted)
     }
 

@@ -1,12 +1,10 @@
 //! Blocks that what is known does not explain: has the joint changed, or a reading, or the zero?
 
-use super::solve::{ZEROS, anywhere};
-use super::{Blocks, Carried, Closed};
+use super::{Blocks, Closed};
 use crate::balance;
 use crate::causes::{Cause, Known, Noise, Odds, TABLE};
-use crate::choices::{BLOCKS, CONVINCING, DRIFTED, EVEN, FEWEST, REST, UNUSUAL, USEFUL};
+use crate::choices::{BLOCKS, CONVINCING, EVEN, FEWEST, REST, UNUSUAL};
 use crate::gram::{Gram, Set, UNKNOWNS, inverse, set};
-use crate::spring::TERMS;
 use crate::unknowns::{ASYMMETRY, CORNER, DAMPING, INERTIA, SPRING, ZERO};
 
 impl Blocks {
@@ -154,72 +152,9 @@ impl Blocks {
         self.solve();
     }
 
-    pub(super) fn carry_over(&mut self, opens: Set) {
-        let Some(posterior) = &self.posterior else { return };
-        let kept = posterior.set & !opens;
-        let mut x = posterior.x;
-        for (i, unknown) in SPRING.enumerate() {
-            x[unknown] = self.spring.alpha[i];
-        }
-        x[ZERO] = self.spring.zero;
-        let mut covariance = posterior.covariance;
-        SPRING.for_each(|i| covariance[i][i] += (DRIFTED * x[i]).powi(2));
-        self.carried = Some(Carried {
-            x,
-            precision: inverse(&covariance, kept),
-            set: kept,
-            deflection: self.deflection,
-            unexplained: self.usual_unexplained().min(self.unexplained),
-        });
-    }
-
     /// Positions may count from elsewhere since a restart: blocks tell.
     pub fn suspect_zero(&mut self) {
         self.begin_doubt();
         self.suspected = true;
-    }
-
-    /// Where the zero between the encoders is, is not known any more.
-    pub fn lose_zero(&mut self) {
-        let found = self.located && !self.doubting && !self.is_unconfirmed() && self.is_explained();
-        let guessed = self.zero_torque(self.spring.curve(0.0).1) > USEFUL * self.torque;
-        if self.are_few() && self.carried.is_none() {
-            self.spring.reset(); // a few blocks have taught nothing: their zero may have been another one, too
-        } else if let Some(carried) =
-            self.carried.as_ref().filter(|one| self.lost && !found && one.set & set(SPRING) != 0)
-        {
-            // What was learned without a zero may be of another one: as it was before.
-            self.spring.alpha[..TERMS].copy_from_slice(&carried.x[SPRING]);
-        } else {
-            self.carry_over(1 << ZERO | !(anywhere() | set(SPRING)));
-            if guessed {
-                // What was learned by a zero that was another one is of another spring.
-                self.carried.iter_mut().for_each(|carried| carried.keep(1 << INERTIA));
-                self.spring.reset();
-            }
-        }
-        let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
-        self.forget_rows();
-        (self.carried, self.lost, self.posterior, self.located) = (carried, true, None, false);
-        self.spring.zero = 0.0; // deflections are counted from elsewhere
-        if self.carried.is_some() {
-            (self.noise, self.own) = (noise, own);
-        }
-    }
-
-    /// The deflections are counted from near the zero, from now on.
-    pub fn recentre(&mut self) {
-        self.lose_zero();
-        self.located = true;
-    }
-
-    /// Evidence has said where the zero is: it is known when two blocks say so, and the balance is linearised near it: a
-    /// step of the iteration stays within a part of the motion.
-    pub(super) fn place_zero(&mut self, moved: bool, step: f64) {
-        if !self.lost {
-            let near = f64::from(ZEROS) * step <= self.seen[1] - self.seen[0];
-            self.located = near && moved == self.moved;
-        }
-        self.moved = moved;
     }
 }

@@ -62,7 +62,7 @@ impl Blocks {
 
     /// Functions near the law as it is known, where the present ones do not hold it: what follows is learned with them.
     ///
-    /// What has been learned of all but the spring is carried over; rows are sums of the functions before, and are
+    /// What has been learned of all but the spring is before over; rows are sums of the functions before, and are
     /// forgotten. Whether that has been done.
     pub(super) fn reform(&mut self) -> bool {
         if self.is_elsewhere() || self.doubting {
@@ -78,8 +78,8 @@ impl Blocks {
         self.family = Family::Near(self.spring.law.clone(), self.spring.parameters()[1]);
         let usual = self.usual_unexplained();
         self.carry_over(set(SPRING) | set(CORNER) | 1 << ZERO);
-        if let Some(carried) = &mut self.carried {
-            carried.unexplained = usual; // the joint is as it was, but goes further: it may leave more
+        if let Some(before) = &mut self.before {
+            before.unexplained = usual; // the joint is as it was, but goes further: it may leave more
         }
         self.ring.clear();
         self.peaks.clear();

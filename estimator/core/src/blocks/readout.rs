@@ -76,7 +76,7 @@ impl Blocks {
         let straight = self.spring.is_constant() && !self.moved;
         let both_sides = !self.spring.is_searched() || self.seen[0] < 0.0 && 0.0 < self.seen[1];
         let bends = known.set & bending != 0 || self.spring.is_longer(known.set);
-        let before = self.carried.as_ref().is_some_and(|carried| carried.set >> ZERO & 1 == 1);
+        let before = self.before.as_ref().is_some_and(|before| before.set >> ZERO & 1 == 1);
         let told = both_sides && !bends && (before || self.ring.len() > FEWEST);
         if !straight && told {
             return 0.0;
@@ -92,8 +92,8 @@ impl Blocks {
 
     /// What was left before a change, or before a zero was lost: neither makes the balance noisier.
     pub(super) fn usual_unexplained(&self) -> f64 {
-        let carried = self.carried.as_ref().filter(|_| self.ring.len() < BLOCKS);
-        carried.map_or(f64::INFINITY, |carried| carried.unexplained)
+        let before = self.before.as_ref().filter(|_| self.ring.len() < BLOCKS);
+        before.map_or(f64::INFINITY, |before| before.unexplained)
     }
 
     /// Whether the balance leaves less than a useful estimate may, and about what it left before a change, by a law that

@@ -1,20 +1,18 @@
 //! The unknowns of one motor's balance from the sum of its blocks: prior, noise, choice.
 
-use super::{Blocks, Carried};
+use super::Blocks;
+use super::before::{Before, anywhere};
 use crate::balance;
-use crate::choices::{ACCUSED, EXACT, FEWEST, REACHED, SURE};
+use crate::choices::{EXACT, FEWEST, SURE};
 use crate::gram::{
     COLUMNS, Frame, Gram, Posterior, Prior, Reduced, Row, Set, UNKNOWNS, choose, dot, log_evidence, set,
     solve, unknowns,
 };
 use crate::laws::{Law, PARAMETERS};
-use crate::spring::Projection;
 use crate::unknowns::{
-    ACTIVE, CANDIDATES, CLIPS, DRY, ECCENTRIC, INERTIA, LOAD, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO,
+    ACTIVE, CANDIDATES, CLIPS, DRY, ECCENTRIC, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO,
 };
 
-pub(super) const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
-const TRIED: usize = 2 * ZEROS as usize + 1;
 const WIDE: f64 = 1e6; // of a prior that says nothing
 const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
 
@@ -24,17 +22,13 @@ pub(super) type Groups = [Set; ALONE + SPRING.end - SPRING.start];
 
 impl Blocks {
     pub(super) fn prior(&self, total: &Gram, frame: &Frame, zero_std: f64) -> Prior {
-        self.prior_of(&self.spring, total, frame, zero_std)
-    }
-
-    fn prior_of(&self, spring: &Spring, total: &Gram, frame: &Frame, zero_std: f64) -> Prior {
-        self.prior_after(self.carried.as_ref(), spring, total, frame, zero_std)
+        self.prior_after(self.before.as_ref(), &self.spring, total, frame, zero_std)
     }
 
     /// By what was known before.
-    fn prior_after(
+    pub(super) fn prior_after(
         &self,
-        before: Option<&Carried>,
+        before: Option<&Before>,
         spring: &Spring,
         total: &Gram,
         frame: &Frame,
@@ -42,12 +36,12 @@ impl Blocks {
     ) -> Prior {
         let scale = Scale { zero_std, deflection: self.deflection, period_s: self.period };
         let mut prior = spring.prior(&self.motor, &self.priors, total, frame, &scale);
-        let Some(carried) = before else { return prior };
-        for i in unknowns(carried.set) {
-            prior.precision[i] = carried.precision[i];
-            prior.mean[i] = carried.x[i];
+        let Some(before) = before else { return prior };
+        for i in unknowns(before.set) {
+            prior.precision[i] = before.precision[i];
+            prior.mean[i] = before.x[i];
         }
-        spring.from_base(&mut prior.mean, carried.set);
+        spring.from_base(&mut prior.mean, before.set);
         prior
     }
 
@@ -102,70 +96,12 @@ impl Blocks {
         }
     }
 
-    /// How well a lost zero at each of some places explains the rows, by what was known before and linearised there, and
-    /// where it is then.
-    fn tried(&self, before: &Carried, spring: &Spring, total: &Gram, step: f64) -> [(f64, f64); TRIED] {
-        let ([low, high], mut tried) = (self.seen, spring.clone());
-        let powers = set(SPRING.start..SPRING.start + spring.least) | self.carried.as_ref().map_or(0, |one| one.set);
-        let asked = ACTIVE & !(set(SPRING) & !powers);
-        let projection = Projection::between(&self.family, self.deflection, low, high);
-        std::array::from_fn(|k| {
-            tried.zero = step * (k as f64 - f64::from(ZEROS));
-            let nothing = (f64::NEG_INFINITY, tried.zero);
-            if (tried.zero + low).abs().max((tried.zero + high).abs()) > REACHED * tried.reach() {
-                return nothing;
-            }
-            let frame = tried.frame(&projection);
-            let prior = self.prior_after(Some(before), &tried, total, &frame, self.deflection);
-            let noise = self.noise.variance * self.correlated;
-            solve(&frame.reduce(total), frame.set & asked, &prior, noise)
-                .map_or(nothing, |one| (one.log_evidence, tried.zero + one.x[ZERO]))
-        })
-    }
-
-    /// Where a lost zero is; `None`: all that explain the rows do not agree, be the joint as it was or another one.
-    fn locate(&self, total: &Gram) -> Option<f64> {
-        let (before, [low, high]) = (self.carried.as_ref()?, self.seen);
-        let step = before.deflection.max(high - low) / f64::from(ZEROS);
-        let mut found = [[(f64::NEG_INFINITY, 0.0); TRIED]; 2];
-        found[0] = self.tried(before, &self.spring, total, step);
-        if before.knows_spring() {
-            let (other, spring) = self.another(before);
-            found[1] = self.tried(&other, &spring, total, step);
-            found[1].iter_mut().for_each(|one| one.0 -= rarity());
-        }
-        let found = found.as_flattened();
-        let best = found.iter().copied().max_by(|a, b| a.0.total_cmp(&b.0))?;
-        if std::env::var("DBG").is_ok() { eprintln!("LOC n {} size {:.4} seen {:?} best {:?} other best {:?} own {:.3e} noise {:.3e}", self.ring.len(), self.deflection, self.seen, best, found[TRIED..].iter().copied().max_by(|a, b| a.0.total_cmp(&b.0)), self.own, self.noise.variance); }
-        let rival = |one: &(f64, f64)| (one.1 - best.1).abs() > 2.0 * step && one.0 > best.0 - ACCUSED.ln();
-        (best.0.is_finite() && !found.iter().any(rival)).then_some(best.1)
-    }
-
-    /// Whether the balance can be linearised where its zero is.
-    fn is_located(&mut self, total: &Gram) -> bool {
-        if !self.lost || self.located || self.spring.is_constant() {
-            return true;
-        }
-        if self.carried.is_none() {
-            self.located = true; // near where deflections are counted from, or sought again
-            return true;
-        }
-        let Some(zero) = self.locate(total) else { return false };
-        self.located = true;
-        if zero.abs() > self.deflection / f64::from(ZEROS) {
-            self.off = zero;
-            return false;
-        }
-        self.spring.zero = zero;
-        true
-    }
-
     /// Where the first blocks' iteration begins.
     fn begin(&mut self, total: &Gram, torque: f64) {
         if self.noise.variance.is_nan() {
             self.noise.variance = 1e-4 * torque;
         }
-        let few = self.ring.len() <= FEWEST && self.carried.is_none();
+        let few = self.ring.len() <= FEWEST && self.before.is_none();
         if self.spring.is_searched() && (few || !self.spring.known) {
             self.start(total, self.noise.variance * self.correlated);
         }
@@ -206,7 +142,7 @@ impl Blocks {
             }
             let noise = self.noise.variance * self.noise.correlated;
             if let Some((other, spring)) = self.anew(&frame, &reduced, &total, &prior, noise) {
-                (self.carried, self.spring) = (Some(other), spring);
+                (self.before, self.spring) = (Some(other), spring);
                 prior = self.prior(&total, &frame, zero);
             }
             let Some((mut chosen, moved)) = self.choose(&frame, &reduced, &total, &prior, noise) else {
@@ -254,7 +190,7 @@ impl Blocks {
     /// The noise is what all unknowns together leave, the zero anywhere; it decides how many of them there are.
     fn measure(&mut self, frame: &Frame, reduced: &Reduced, prior: &Prior, total: &Gram) {
         let floor = (EXACT * total.rms(balance::TORQUE)).powi(2);
-        if self.carried.is_some() && self.ring.len() < FEWEST {
+        if self.before.is_some() && self.ring.len() < FEWEST {
             return; // it is as noisy as it was
         }
         // What few rows leave is less than their noise, as they are fitted: at first no less is assumed than usual.
@@ -294,7 +230,7 @@ impl Blocks {
     /// The unknowns that there are without a choice, and the groups that evidence adds.
     pub(super) fn groups(&self, frame: &Frame) -> (Set, Groups) {
         let mut groups = Groups::default();
-        let mut base = frame.set & (ACTIVE | self.carried.as_ref().map_or(0, |carried| carried.set));
+        let mut base = frame.set & (ACTIVE | self.before.as_ref().map_or(0, |before| before.set));
         for (group, candidate) in groups.iter_mut().zip(&CANDIDATES) {
             *group = set(candidate.unknowns.clone());
         }
@@ -345,7 +281,7 @@ impl Blocks {
     }
 
     /// The same as far as so many blocks can tell: few rows show noise as effects; powers are one of a line.
-    fn offered(&self, frame: &Frame) -> (Set, Groups) {
+    pub(super) fn offered(&self, frame: &Frame) -> (Set, Groups) {
         let (base, mut groups) = self.groups(frame);
         if self.ring.len() < FEWEST {
             let effects = if self.spring.is_line() { groups.len() } else { CANDIDATES.len() };
@@ -355,7 +291,7 @@ impl Blocks {
     }
 
     /// By how much rarer one explanation with a further cause is than another, before any data: ln of the odds.
-    fn rarer(&self, instead: &Posterior, found: &Posterior) -> f64 {
+    pub(super) fn rarer(&self, instead: &Posterior, found: &Posterior) -> f64 {
         let effects = |of: &Posterior| {
             let chosen = CANDIDATES.iter().filter(|one| set(one.unknowns.clone()) & of.set != 0).count();
             chosen as f64 + f64::from(self.spring.is_longer(of.set))
@@ -363,35 +299,8 @@ impl Blocks {
         (1.0 + effects(instead) - effects(found)) * rarity()
     }
 
-    /// The joint after a restart as another one, where that explains the rows better than what was known before.
-    fn anew(
-        &self,
-        frame: &Frame,
-        reduced: &Reduced,
-        total: &Gram,
-        prior: &Prior,
-        noise: f64,
-    ) -> Option<(Carried, Spring)> {
-        let before = self.carried.as_ref().filter(|before| self.lost && before.knows_spring())?;
-        let (other, spring) = self.another(before);
-        let open = self.prior_after(Some(&other), &spring, total, frame, self.deflection);
-        let (base, groups) = self.offered(frame);
-        let found = self.chosen(reduced, base, &groups, prior, noise)?;
-        let instead = self.chosen(reduced, base, &groups, &open, noise)?;
-        let odds = instead.log_evidence - found.log_evidence;
-        (odds > self.rarer(&instead, &found)).then_some((other, spring))
-    }
-
-    /// Of what was known before, what another joint with this motor has in common with it.
-    fn another(&self, before: &Carried) -> (Carried, Spring) {
-        let (mut other, mut spring) = (before.clone(), self.spring.clone());
-        other.keep(1 << INERTIA | 1 << OFFSET);
-        spring.forget();
-        (other, spring)
-    }
-
     /// The unknowns of these groups that evidence chooses.
-    fn chosen(
+    pub(super) fn chosen(
         &self,
         reduced: &Reduced,
         base: Set,
@@ -432,13 +341,8 @@ impl Blocks {
 }
 
 /// ln of the odds against a further cause before any data: as many are held against one another.
-fn rarity() -> f64 {
+pub(super) fn rarity() -> f64 {
     (Groups::default().len() as f64).ln()
-}
-
-/// Unknowns that are the same wherever the zero is.
-pub(super) fn anywhere() -> Set {
-    set(1..SPRING.start + 1) | set(ZERO..LOAD.start) | set(RATE..CLIPS.start) | set(ECCENTRIC)
 }
 
 /// Unknowns whose shapes no joint has quite: friction, memory, the free curve.

@@ -19,7 +19,7 @@ from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.problem import Problem
 from estimator.gate import at_limit
 from estimator.identify import identify
-from estimator.model import JointModel
+from estimator.model import JointModel, Transmission
 from estimator.sample import SIGMA_95, FloatArray, Record
 
 PARTS = 4
@@ -139,6 +139,16 @@ def test_where_a_torque_rests_on_its_limit_more_may_have_acted():
     assert any("as if clipped" in note for note in identified.notes)
     k = identified.fits[0].parameters["k_nm_rad"]
     assert k == pytest.approx(kit.STIFFNESS, rel=0.002)
+
+
+@pytest.mark.parametrize("order", [3, 4])
+def test_the_zero_of_a_spring_that_bends_is_found_before_it_is_judged(order):
+    """Far from it a straight line through the spring promises more than there is."""
+    (record,) = kit.World([{"bend_nm_rad2": 3000.0, "zero_rad": 0.02}]).run()
+    (motor,) = kit.model(linked=False).motors
+    own = replace(motor, transmission=Transmission(model="polynomial", order=order))
+    fitted = Problem([record], replace(kit.model(linked=False), motors=(own,)), 15.0).null()
+    assert fitted.total("everyday", "deflection_offset", 0, run=0)[0] == pytest.approx(0.02, abs=3e-4)
 
 
 def test_a_torque_that_is_often_at_its_limit_is_as_it_is():

@@ -29,6 +29,7 @@ from estimator.diagnosis.probabilities import chances, standing
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Rival
 from estimator.diagnosis.search import Search
+from estimator.diagnosis.twins import Twin
 from estimator.diagnosis.verdict import Judge, _Judged
 from estimator.identify import identify
 from estimator.model import JointModel, Motor, Transmission
@@ -85,6 +86,16 @@ def test_each_candidate_has_one_probability_whoever_names_it():
         stands = standing(found, k, beside, chance)
         assert stands.probability == pytest.approx(own)
         assert stands.alternatives == (("gravity", chance["gravity", 0]),)
+
+
+def test_a_further_ripple_is_listed_by_the_name_of_its_kind():
+    terms = [SimpleNamespace(candidate=SimpleNamespace(key=("encoder_eccentricity", None)))]
+    keys = frozenset({("encoder_eccentricity", None), ("kinematic_error", 0)})
+    found: Any = SimpleNamespace(keys=keys, named=keys, terms=terms)
+    ripple = Twin(frozenset({("encoder_eccentricity", None)}), frozenset({("kinematic_error'", 0)}), False)
+    chance = chances(found, [(1.0, found)], [ripple])
+    assert chance["kinematic_error", 0] == 1.0
+    assert standing(found, 0, [(1.0, found)], chance, [ripple]) == (0.5, (("kinematic_error", 0.5),))
 
 
 def test_what_was_found_stands_among_the_candidates_though_it_was_not_promising_at_first():

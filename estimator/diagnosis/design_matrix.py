@@ -42,9 +42,10 @@ class Term:
 
     @property
     def free(self) -> list[str]:
-        """Nonlinear parameters that are fitted."""
+        """Nonlinear parameters that are fitted; once a turn is once a turn."""
         law = ("exponent", "shape") if self.values.get("exponent", 1.0) >= STOP_EXPONENT else ()
-        return [name for name in self.values if name not in ("side", "power", *law)]
+        once = ("periods_per_rev",) if self.values.get("periods_per_rev") == 1.0 else ()
+        return [name for name in self.values if name not in ("side", "power", *law, *once)]
 
 
 class Extra(NamedTuple):

@@ -197,15 +197,17 @@ class Problem:
     ) -> Fitted:
         """Return the Gauss-Newton iteration from a given point; return the best point.
 
-        The evidence of the first steps is too optimistic far from the optimum and is not used to stop; the
-        fit of a healthy joint continues until it converges.
+        The evidence is too optimistic of the first step, and where the next correction of a reading is more
+        than its standard deviation: of a hypothesis that is kept it does not stop there. The fit of a healthy
+        joint continues until it converges.
         """
         best = self._linearised(terms, base, corrections, extra, pinned or {})
         for k in range(whole("newton_steps") if steps is None else steps):
             if not self._curved(best) or _converged(best):
                 break
             now = self._linearised(*self._moved(best), extra, pinned or {})
-            if k and not self.calibrating and now.posterior.evidence < best.evidence(now):
+            judged = not self.calibrating and (steps is not None or _read(best))
+            if k and judged and now.posterior.evidence < best.evidence(now):
                 break
             best = now
         return best
@@ -344,6 +346,13 @@ def _weighed(terms: tuple[Term, ...], slots: list[Slot], x: FloatArray) -> tuple
         )
         made.append(replace(term, weights=weights))
     return tuple(made)
+
+
+def _read(fitted: Fitted) -> bool:
+    """Whether no correction of a reading is more than its standard deviation."""
+    std = np.sqrt(np.maximum(np.diag(fitted.posterior.covariance), 0.0))
+    moves = zip(fitted.slots, fitted.posterior.x, std, strict=True)
+    return all(abs(x) <= s for slot, x, s in moves if slot.name in READINGS)
 
 
 def _converged(fitted: Fitted) -> bool:

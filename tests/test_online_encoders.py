@@ -200,6 +200,25 @@ def test_what_few_blocks_between_two_reboots_say_of_a_constant_torque_is_not_car
     assert valid > 1000
 
 
+def test_friction_is_found_anew_after_a_reboot():
+    """A motion in one direction does not tell friction from where the zero of a straight spring is."""
+    motion = kit.motion("constant", 24.0, seed=0)
+    estimator = kit.make_estimator(kit.declared("constant"), kit.EstimatorSettings(), kit.PERIOD_S)
+    rms, before = np.sqrt(np.mean(motion.torque_nm**2)), motion.samples[0].motor_position_rad[0]
+    for k, sample in enumerate(motion.samples):
+        direction = np.sign(sample.motor_position_rad[0] - before)
+        before = sample.motor_position_rad[0]
+        if k == 12000:
+            estimator.lose_zeros()
+        if k < 12000:
+            torque = sample.motor_torque_nm[0] + 0.3 * rms * direction
+            sample = sample._replace(motor_torque_nm=(torque, *sample.motor_torque_nm[1:]))
+        one = estimator.step(sample)
+        if k >= 12000 and one.status & kit.VALID:
+            assert abs(one.flexibility_torque_nm - motion.torque_nm[k]) < 0.25 * rms, k
+    assert one.status & kit.VALID
+
+
 def test_a_zero_that_was_only_guessed_is_no_measure_of_the_next_one():
     """The first reboot is at a time at which nothing is known: the zero is taken to be the declared one."""
     joint, offs, off = load(QUADRATIC), {400: 0.1876, 4400: -0.0625}, 0.0

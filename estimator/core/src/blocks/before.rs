@@ -10,7 +10,9 @@ use super::solve::rarity;
 use crate::choices::{ACCUSED, DRIFTED, REACHED, USEFUL};
 use crate::gram::{Frame, Gram, Prior, Reduced, Set, UNKNOWNS, Vector, inverse, set, solve};
 use crate::spring::{Projection, TERMS};
-use crate::unknowns::{ACTIVE, CLIPS, ECCENTRIC, INERTIA, LOAD, OFFSET, RATE, SPRING, Spring, ZERO};
+use crate::unknowns::{
+    ACTIVE, CLIPS, DRY, ECCENTRIC, INERTIA, LOAD, OFFSET, RATE, SOFT, SPRING, Spring, ZERO,
+};
 
 const ZEROS: i32 = 12; // that are tried to either side, over the deflection seen
 const TRIED: usize = 2 * ZEROS as usize + 1;
@@ -72,7 +74,7 @@ impl Blocks {
             // What was learned without a zero may be of another one: as it was before.
             self.spring.alpha[..TERMS].copy_from_slice(&before.x[SPRING]);
         } else {
-            self.carry_over(1 << ZERO | !(anywhere() | set(SPRING)));
+            self.carry_over(1 << ZERO | 1 << DRY | 1 << SOFT | !(anywhere() | set(SPRING)));
             if guessed {
                 // What was learned by a zero that was another one is of another spring.
                 self.before.iter_mut().for_each(|before| before.keep(1 << INERTIA));

@@ -186,9 +186,7 @@ class NodeLayout:
     """One node of a joint."""
 
     node_id: int  # 1 to 127
-    motor: (
-        _Motor | None
-    )  # index of the motor this drive belongs to, or None for a node that is only an encoder
+    motor: _Motor | None  # index of the motor that this drive belongs to; None: only an encoder
     tpdos: tuple[TpdoLayout, ...]  # its frames that carry signals of the joint
     other_tpdos: tuple[TpdoLayout, ...] = ()  # enabled frames of this node that are not used but load the bus
     heartbeat_ms: int = 0  # period of the heartbeat the node produces, as read back; 0: none, or not known

@@ -212,7 +212,8 @@ def _take(
 @contextmanager
 def _client(settings: Settings, tasks: int) -> Iterator[Client]:
     """A client of the given scheduler, or of a local cluster that ends with it."""
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in ("distributed", "asyncio"):  # what ends a task that nobody awaits is told by the task's result
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     dask.config.set(
         {
             "distributed.comm.timeouts.connect": f"{_CONNECT_S:g}s",

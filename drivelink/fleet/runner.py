@@ -212,7 +212,7 @@ def _take(
 @contextmanager
 def _client(settings: Settings, tasks: int) -> Iterator[Client]:
     """A client of the given scheduler, or of a local cluster that ends with it."""
-    for name in ("distributed", "asyncio"):  # what ends a task that nobody awaits is told by the task's result
+    for name in ("distributed", "asyncio"):  # what matters of them is in a result
         logging.getLogger(name).setLevel(logging.CRITICAL)
     dask.config.set(
         {

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
+os.environ["TERM"] = "xterm-256color"  # what is drawn is the same wherever tests run
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # many processes would each compile every library
 
 import can.interfaces.virtual

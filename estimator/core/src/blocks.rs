@@ -285,7 +285,7 @@ impl Blocks {
         self.end_doubt();
         self.solve();
         if self.lost && self.located && self.off == 0.0 && !self.is_explained() {
-            self.lose_zero();
+            self.lose_zero(); // it was located wrongly
         }
         Closed::Added
     }

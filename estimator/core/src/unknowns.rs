@@ -15,7 +15,7 @@ use crate::choices::REACHED;
 use crate::gram::{COLUMNS, Frame, Gram, Matrix, Posterior, Row, Set, UNKNOWNS, Vector, set};
 use crate::laws::{Alpha, Law, PARAMETERS};
 use crate::model::{Motor, Transmission};
-use crate::spring::{Coefficients, Projection, TERMS};
+use crate::spring::{Coefficients, NODES, Projection, TERMS};
 
 /// B, kg·m².
 pub const INERTIA: usize = 1;
@@ -384,8 +384,6 @@ impl Spring {
         projection.of(|phi| self.curve(phi).1)
     }
 }
-
-const NODES: usize = crate::spring::NODES;
 
 fn place(row: &mut Row, coefficients: &Coefficients, sign: f64) {
     let columns = row[balance::SPRING.start..].iter_mut();

@@ -38,13 +38,8 @@ fn main() -> Result<(), Failure> {
                 None => eprintln!("no estimate of {joint} at {endpoint}: `drivelink list` names the joints"),
             }
         };
-        let estimate = match Estimate::decode(sample.payload()) {
-            Ok(estimate) => estimate,
-            Err(error) => {
-                eprintln!("not used: {error}");
-                continue;
-            }
-        };
+        let decoded = Estimate::decode(sample.payload()).inspect_err(|error| eprintln!("not used: {error}"));
+        let Ok(estimate) = decoded else { continue };
         missing += last.map_or(0, |last| estimate.sequence.saturating_sub(last + 1));
         last = Some(estimate.sequence);
         let now_ns = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as i128;

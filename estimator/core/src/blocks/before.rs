@@ -6,9 +6,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::Blocks;
-use super::solve::rarity;
+use super::solve::{Rows, rarity};
 use crate::choices::{ACCUSED, DRIFTED, REACHED, USEFUL};
-use crate::gram::{Frame, Gram, Prior, Reduced, Set, UNKNOWNS, Vector, inverse, set, solve};
+use crate::gram::{Gram, Prior, Set, UNKNOWNS, Vector, inverse, set, solve};
 use crate::spring::{Projection, TERMS};
 use crate::unknowns::{
     ACTIVE, CLIPS, DRY, ECCENTRIC, INERTIA, LOAD, OFFSET, RATE, SOFT, SPRING, Spring, ZERO,
@@ -69,7 +69,7 @@ impl Blocks {
         if self.are_few() && self.before.is_none() {
             self.spring.reset(); // a few blocks have taught nothing: their zero may have been another one, too
         } else if let Some(before) =
-            self.before.as_ref().filter(|one| self.lost && !found && one.set & set(SPRING) != 0)
+            self.before.as_ref().filter(|one| self.lost && !found && one.knows_spring())
         {
             // What was learned without a zero may be of another one: as it was before.
             self.spring.alpha[..TERMS].copy_from_slice(&before.x[SPRING]);
@@ -165,14 +165,8 @@ impl Blocks {
     }
 
     /// The joint after a restart as another one, where that explains the rows better than what was known before.
-    pub(super) fn anew(
-        &self,
-        frame: &Frame,
-        reduced: &Reduced,
-        total: &Gram,
-        prior: &Prior,
-        noise: f64,
-    ) -> Option<(Before, Spring)> {
+    pub(super) fn anew(&self, rows: &Rows, prior: &Prior) -> Option<(Before, Spring)> {
+        let Rows { frame, reduced, total, noise } = *rows;
         let before = self.before.as_ref().filter(|before| self.lost && before.knows_spring())?;
         let (other, spring) = self.another(before);
         let open = self.prior_after(Some(&other), &spring, total, frame, self.deflection);

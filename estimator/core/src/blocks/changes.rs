@@ -119,7 +119,7 @@ impl Blocks {
             return Closed::Begun;
         }
         if self.lost && self.doubted >= FEWEST {
-            self.lose_zero();
+            self.lose_zero(); // it was located wrongly
             return Closed::Unexplained;
         }
         if self.doubted >= BLOCKS {

@@ -1,11 +1,10 @@
 //! The interval: what other explanations may change, what noise in the positions takes off, errors of the model.
 
 use super::Blocks;
-use super::solve::ALONE;
+use super::solve::{ALONE, Rows};
 use crate::choices::{ALIKE, EVEN, EXACT, FEWEST, UNLIKE};
 use crate::gram::{
-    Frame, Gram, Matrix, Posterior, Prior, Reduced, UNKNOWNS, by_prior, cluster, log_evidence, set, solve,
-    unknowns,
+    Frame, Matrix, Posterior, Prior, UNKNOWNS, by_prior, cluster, log_evidence, set, solve, unknowns,
 };
 use crate::student::t_95;
 use crate::unknowns::{DRY, INERTIA, LATE, OFFSET, SPRING, ZERO};
@@ -15,15 +14,8 @@ impl Blocks {
     /// probabilities.
     ///
     /// Hoeting et al., "Bayesian model averaging: a tutorial", Statistical Science 14(4), 1999.
-    pub(super) fn omitted(
-        &self,
-        frame: &Frame,
-        reduced: &Reduced,
-        total: &Gram,
-        chosen: &Posterior,
-        prior: &Prior,
-        noise: f64,
-    ) -> Matrix {
+    pub(super) fn omitted(&self, rows: &Rows, chosen: &Posterior, prior: &Prior) -> Matrix {
+        let Rows { frame, reduced, total, noise } = *rows;
         let mut between = [[0.0; UNKNOWNS]; UNKNOWNS];
         let (_, groups) = self.groups(frame);
         let many = groups.iter().filter(|group| **group != 0).count() as f64;

@@ -18,6 +18,14 @@ const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
 
 pub(super) const ALONE: usize = CANDIDATES.len() + SPRING.end - SPRING.start; // groups that are not several others
 
+/// All rows as one linearisation has them; `noise`: variance of an independent one.
+pub(super) struct Rows<'a> {
+    pub(super) frame: &'a Frame,
+    pub(super) reduced: &'a Reduced,
+    pub(super) total: &'a Gram,
+    pub(super) noise: f64,
+}
+
 pub(super) type Groups = [Set; ALONE + SPRING.end - SPRING.start];
 
 impl Blocks {
@@ -141,26 +149,22 @@ impl Blocks {
                 self.measure(&frame, &reduced, &elsewhere, &total);
             }
             let noise = self.noise.variance * self.noise.correlated;
-            if let Some((other, spring)) = self.anew(&frame, &reduced, &total, &prior, noise) {
+            let rows = Rows { frame: &frame, reduced: &reduced, total: &total, noise };
+            if let Some((other, spring)) = self.anew(&rows, &prior) {
                 (self.before, self.spring) = (Some(other), spring);
                 prior = self.prior(&total, &frame, zero);
             }
-            let Some((mut chosen, moved)) = self.choose(&frame, &reduced, &total, &prior, noise) else {
-                return;
-            };
+            let Some((mut chosen, moved)) = self.choose(&rows, &prior) else { return };
             let used = if moved { self.prior(&total, &frame, self.deflection) } else { prior };
             let own = self.leave(&frame, &chosen, &total, torque);
-            let far = SPRING.clone().chain([ZERO]).any(|i| {
-                chosen.x[i].abs() > 0.1 * chosen.covariance[i][i].sqrt() && chosen.set >> i & 1 == 1
-            });
             let before = chosen.x;
             self.spring.move_by(&before, self.deflection);
-            if step + 1 < STEPS && far && !self.spring.is_settled() {
+            if step + 1 < STEPS && is_far(&chosen) && !self.spring.is_settled() {
                 continue;
             }
             self.place_zero(moved, before[ZERO].abs());
             self.friction = frame.rms(&total, &chosen, shaped());
-            let omitted = self.omitted(&frame, &reduced, &total, &chosen, &used, noise);
+            let omitted = self.omitted(&rows, &chosen, &used);
             let attenuated = self.attenuated(&chosen, total.rows, noise);
             self.widen(&frame, &mut chosen, &used, noise, own);
             let more = omitted.iter().flatten().zip(attenuated.iter().flatten());
@@ -252,14 +256,8 @@ impl Blocks {
     }
 
     /// The unknowns that evidence chooses, and whether the zero is anywhere.
-    fn choose(
-        &self,
-        frame: &Frame,
-        reduced: &Reduced,
-        total: &Gram,
-        prior: &Prior,
-        noise: f64,
-    ) -> Option<(Posterior, bool)> {
+    fn choose(&self, rows: &Rows, prior: &Prior) -> Option<(Posterior, bool)> {
+        let Rows { frame, reduced, total, noise } = *rows;
         let (base, mut groups) = self.offered(frame);
         let found = self.chosen(reduced, base, &groups, prior, noise)?;
         if self.ring.len() >= FEWEST && !self.lost && frame.set >> ZERO & 1 == 1 {
@@ -338,6 +336,12 @@ impl Blocks {
         let open = spring.law.is_polynomial() && !spring.is_anchored() && !straight;
         !open || 2.0 * moved.abs() < high.min(-low)
     }
+}
+
+/// Whether the law was linearised elsewhere than where it was found.
+fn is_far(found: &Posterior) -> bool {
+    let far = |i: usize| found.x[i].abs() > 0.1 * found.covariance[i][i].sqrt();
+    SPRING.chain([ZERO]).any(|i| found.set >> i & 1 == 1 && far(i))
 }
 
 /// ln of the odds against a further cause before any data: as many are held against one another.

@@ -3,18 +3,21 @@
 import json
 import signal
 from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
 import daemonkit
+import pytest
 import zenohkit
 
 from drivelink import cli, jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.cli.record import _Summary
 from drivelink.cycle.sources import CanFrame
+from drivelink.monitor.watcher import Watcher
 from drivelink.recording import read
 from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink
@@ -162,6 +165,33 @@ def test_a_daemon_that_fell_silent_is_said(tmp_path, monkeypatch):
             assert text.endswith(f"nothing from the daemon for {silent} s" if silent else "in 0 s")
             stream.try_recv.side_effect = [MagicMock(), None]
             tap.poll()
+
+
+@pytest.mark.parametrize("what", ["recorder", "bus", "monitor"])
+def test_what_comes_faster_than_it_is_used_keeps_nobody_from_flushing_and_ending(what, tmp_path, monkeypatch):
+    """As on a machine that has other things to do: record and the black box did not even end by SIGTERM."""
+    for module in ("recording.recorder", "monitor.watcher"):
+        monkeypatch.setattr(f"drivelink.{module}.follow_document", MagicMock())
+    came, session, joint = count(), MagicMock(), daemonkit.vsa()
+    message = SimpleNamespace(source_info=None)
+
+    def more(*_):
+        assert next(came) < 50_000, "it never ends"
+        return message
+
+    with Recorder(sink := open_sink(tmp_path / "a.mcap", joint, ""), []) as recorder:
+        if what == "bus":
+            tap = BusTap(session, joint, sink, None)
+            tap._source = MagicMock(wait=more, receive=lambda: [CanFrame(1, b"", 1)] * 64)
+        else:
+            tap = ZenohTap(session, joint, sink) if what == "recorder" else Watcher(session)
+            stream = MagicMock(try_recv=more)
+            tap._streams = [(stream, lambda _: None) if what == "recorder" else ("estimate", stream)]
+            monkeypatch.setattr(Watcher, "_take", lambda *_: None)
+        tap.poll()
+        if what != "monitor":
+            recorder.taps.append(tap)
+            recorder.run(lambda: next(came) > 2_000)
 
 
 def test_the_line_that_was_rewritten_is_erased_before_the_result(tmp_path, monkeypatch, capsys):

@@ -105,6 +105,7 @@ def _table(annotation: Any) -> Any:
 _LOG = logging.getLogger(__name__)
 
 MAX_BYTES = 256 << 10  # of a joint file; the longest that fit and diagnose write have some 10 KiB
+MAX_LINES = 8 << 10  # what they keep of each costs tomlkit up to 50 µs
 MAX_LINE_BYTES = 4 << 10  # the longest that they write, a baseline, has some 300 bytes
 _OTHERS = 3  # further keys that a message names
 _SHOWN = 80  # characters of a wrong value in a message
@@ -174,11 +175,14 @@ def to_json(text: str, where: str) -> str:
     """Return the text of a joint file as JSON, not yet validated.
 
     Raises:
-        JointFileError: too large, a line too long, cut off, nested too deep, or not TOML.
+        JointFileError: too large, too many lines, a line too long, cut off, nested too deep, or not TOML.
     """
     if len(text) > MAX_BYTES or len(text.encode()) > MAX_BYTES:
         raise JointFileError(f"{where}: expected a joint file, of at most {MAX_BYTES >> 10} KiB, got more")
-    for number, line in enumerate(text.split("\n"), 1):
+    lines = text.split("\n")
+    if len(lines) > MAX_LINES:
+        raise JointFileError(f"{where}: expected at most {MAX_LINES} lines, got {len(lines)}")
+    for number, line in enumerate(lines, 1):
         if len(line.encode()) > MAX_LINE_BYTES:
             at_most = f"expected at most {MAX_LINE_BYTES >> 10} KiB"
             raise JointFileError(f"{where}: line {number}: {at_most}, got {len(line)} letters")

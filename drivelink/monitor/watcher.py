@@ -16,7 +16,15 @@ from drivelink.errors import ZenohError
 from drivelink.monitor.view import JointView
 from drivelink.plaintext import clean_text, natural
 from drivelink.pubsub.clientbase import PATIENCE_S, absent, ask
-from drivelink.pubsub.feed import DECODERS, DOCUMENTS, MAX_CLAIMS, DaemonIdentity, follow_document, source_of
+from drivelink.pubsub.feed import (
+    DECODERS,
+    DOCUMENTS,
+    MAX_CLAIMS,
+    DaemonIdentity,
+    follow_document,
+    source_of,
+    waiting,
+)
 
 MAX_JOINTS = 64  # limit on joints shown, also against invented names
 _QUEUE = 8192
@@ -97,7 +105,7 @@ class Watcher:
             self._hint_s = now_s + PATIENCE_S
             ask(self._session, self._prefix[:-1], self._say)
         for kind, subscriber in self._streams:
-            while (sample := subscriber.try_recv()) is not None:
+            for sample in waiting(subscriber, _QUEUE):
                 self._take(kind, sample, now_s)
         for joint in self._joints.values():
             view = joint.view

@@ -17,8 +17,9 @@ import json
 import math
 import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from enum import StrEnum
+from itertools import islice
 from types import MappingProxyType
 from typing import Any
 
@@ -115,6 +116,11 @@ def follow_document(session: zenoh.Session, key: str, depth: int) -> Any:
     history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
     ring: Any = zenoh.handlers.RingChannel(depth)
     return zenoh.ext.declare_advanced_subscriber(session, key, ring, history=history)
+
+
+def waiting(subscriber: Any, most: int) -> Iterator[zenoh.Sample]:
+    """Yield what waits in a queue, at most so much: on a busy machine more comes meanwhile, without end."""
+    return islice(iter(subscriber.try_recv, None), most)
 
 
 MAX_CLAIMS = (

@@ -23,7 +23,7 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.sources import BusLostError, FrameSource, LostSource, open_source
 from drivelink.errors import BusError, ZenohError
 from drivelink.jointfile import JointFile
-from drivelink.pubsub.feed import DECODERS, DaemonIdentity, follow_document, source_of
+from drivelink.pubsub.feed import DECODERS, DaemonIdentity, follow_document, source_of, waiting
 from drivelink.recording.canlog import LoggedFrame
 from drivelink.recording.cycles import FrameSamples
 from drivelink.recording.limits import MAX_BLOCK_BYTES, MAX_UNREAD
@@ -36,6 +36,7 @@ _LOG = logging.getLogger("drivelink.recording")
 _SNAPSHOTS = 2  # that wait: each has some megabytes
 _FLUSH_S = 1.0
 _POLL_S = 0.005
+_AT_ONCE = 1000  # messages of a key, or frames, until the file has its turn
 _REOPEN_S = 0.5
 _ANSWER_S = 1.0  # of a daemon
 _STALE_S = 1.0  # after which another session may take over without a liveliness token
@@ -108,11 +109,11 @@ class ZenohTap:
         silence_s = now_s - self._heard_s
         return silence_s if _STALE_S < silence_s < math.inf else 0.0
 
-    def poll(self) -> None:
-        """Store everything that has come."""
+    def poll(self, most: int = _AT_ONCE) -> None:
+        """Store what has come, at most so many of a key."""
         now_s = time.monotonic()
         for subscriber, take in self._streams:
-            while (sample := subscriber.try_recv()) is not None:
+            for sample in waiting(subscriber, most):
                 if not self._identity.accepts(source_of(sample), now_s - self._heard_s > _STALE_S):
                     continue
                 self._silent_s += self._silence(now_s)
@@ -201,13 +202,14 @@ class BusTap:
         """Why no samples can be made."""
         return self._samples.missing if self._samples is not None else ""
 
-    def poll(self) -> None:
-        """Store everything that has come."""
+    def poll(self, most: int = _AT_ONCE) -> None:
+        """Store the frames that have come, at most so many."""
         if isinstance(self._source, LostSource):
             self._reopen()
         try:
-            while self._source.wait(0.0):
+            while most > 0 and self._source.wait(0.0):
                 for cob_id, data, stamp_ns in self._source.receive():
+                    most -= 1
                     self._sink.frame(stamp_ns, cob_id, data)
                     if self._samples is not None:
                         self._put_samples(self._samples.feed(LoggedFrame(stamp_ns, cob_id, data, "")))
@@ -282,7 +284,7 @@ class Recorder:
                 tick()
             time.sleep(_POLL_S)
         for tap in self.taps:
-            tap.poll()
+            tap.poll(MAX_UNREAD)
             tap.finish()
 
 

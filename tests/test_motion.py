@@ -10,6 +10,8 @@ import pytest
 
 from drivelink import cli, jointfile, recording
 from drivelink.demo.simulate import alter, world_from_joint
+from drivelink.output import motion as output
+from drivelink.output.numbers import Units
 from estimator.choices import whole
 from estimator.diagnosis import diagnose, motion
 from estimator.diagnosis.fourier import Limits, Shape
@@ -79,6 +81,7 @@ def test_what_the_likeliest_rival_explains_is_no_noise_of_the_motion_to_come(tmp
     outcome = replace(diagnose(record, model), effects=())  # named or not: the recording is the same
     rivals = motion._Rivals(Problem([record], model, outcome.bandwidth_hz), outcome, 4.0, limits())
     assert rivals.models[0].motors[0].effects[-1].name == "coulomb_friction"
+    assert len(rivals.models) == 2  # others the recording has ruled out: no motion is made for them
     assert np.std(rivals.noise[2]) < 0.1 * 0.5
 
 
@@ -100,6 +103,19 @@ def test_a_motion_too_short_for_a_ripple_does_not_tell_it(tmp_path):
         path = path.scaled(share * 2.0 * np.pi / period / np.ptp(path.position))
         told.append(rivals.least(k, rivals.read(driven(path, rivals.models[k])[0])))
     assert told[0] == 0.0 < told[1]
+
+
+def test_a_motion_that_gains_nothing_promises_nothing():
+    zeros, now = np.zeros((100, 1)), (0.95, 0.05)
+    paths = dict.fromkeys(("position_rad", "velocity_rad_s", "acceleration_rad_s2", "torque_nm"), zeros)
+    for told, said in (
+        (np.tile(now, (2, 1)), "No motion of 9.9 s within"),
+        (np.eye(2), "1.00, 0.90 without"),
+    ):
+        found = motion.NextMotion(
+            time_s=np.arange(100) * 0.1, rivals=("a", "b"), now=now, told=told, limits=limits(), **paths
+        )
+        assert said in output.section(found, Units(False)).blocks[0].text
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from drivelink import analysis
 from drivelink.cli import add_number, add_recordings, conclude, recording_path, require_distinct, warn, wrote
-from drivelink.errors import UsageError
+from drivelink.errors import RecordingError, UsageError
 from drivelink.files import check_target
 from drivelink.output.progress import Meter
 from drivelink.recording.mapping import joint_of
@@ -85,8 +85,12 @@ def run(args: argparse.Namespace) -> int:
             warn=warn,
             progress=meter.stage,
         )
+        undesigned: RecordingError | None = None
         if args.motion is not None:
-            found = found.next_motion(args.motion_seconds, meter.stage)
+            try:
+                found = found.next_motion(args.motion_seconds, meter.stage)
+            except RecordingError as error:  # what was found is reported all the same
+                undesigned = error
     conclude(args.json, found.as_json(), found.sections())  # before anything is written, as `fit` does
     made = found.report(args.out)
     try:
@@ -96,4 +100,6 @@ def run(args: argparse.Namespace) -> int:
             made.append(found.write(args.write, force=args.force))
     finally:
         wrote(args.json, made)
+    if undesigned is not None:
+        raise undesigned
     return 0

@@ -46,6 +46,7 @@ def as_json(motion: NextMotion) -> dict[str, Any]:
     return {
         "seconds": float(len(motion.time_s) * (motion.time_s[1] - motion.time_s[0])),
         "decides": motion.decides,
+        "decided": motion.decided,
         "rivals": [
             {"effects": name, "probability": now, "told": told, "least_log_odds": least}
             for name, now, told, least in zip(
@@ -58,9 +59,13 @@ def as_json(motion: NextMotion) -> dict[str, Any]:
 
 def section(motion: NextMotion, units: Units) -> Section:
     """Describe and draw it."""
+    told, before, long = f"{motion.decides:.2f}", f"{motion.decided:.2f}", f"{motion.time_s[-1]:.3g} s"
     said = (
-        f"This motion of {motion.time_s[-1]:.3g} s is expected to tell which it is with a probability of "
-        f"{motion.decides:.2f}. Record it with the drive's position loop, and diagnose that recording."
+        f"This motion of {long} is expected to tell which it is with a probability of {told}, "
+        f"{before} without it. Record it with the drive's position loop, and diagnose that recording."
+        if float(told) > float(before)
+        else f"No motion of {long} within the limits is expected to tell which it is better than "
+        f"the recordings do ({before}): allow more in [motion] of the joint file, or a longer one."
     )
     rows: Rows = []
     for one in as_json(motion)["rivals"]:

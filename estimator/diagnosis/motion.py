@@ -68,6 +68,11 @@ class NextMotion:
         """Probability that the true rival is told, by their present probabilities."""
         return float(np.dot(self.now, np.diag(self.told)))
 
+    @property
+    def decided(self) -> float:
+        """The same of the recordings at hand."""
+        return float(np.dot(self.now, self.now))
+
 
 def design(
     records: Sequence[Record],
@@ -118,6 +123,8 @@ class _Rivals:
         found, fitted = _fitted(search, outcome)
         now = search.held.weights(fitted, found)
         order = np.argsort(-now, kind="stable")[: whole("motion_rivals")]
+        likely = int(np.sum(now[order] > choice("even") * now[order[0]]))
+        order = order[: max(2, likely)]  # others the recordings have ruled out
         self.problem, self.limits = problem, limits
         link = problem.model.link or _link(problem, found)
         step = 1.0 / (_STEPS * problem.bandwidth_hz * problem.period_s)

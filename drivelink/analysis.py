@@ -21,6 +21,7 @@ from drivelink.output.document import Section, as_text, write
 from drivelink.plaintext import some
 from drivelink.recording.columns import parse_column_map
 from drivelink.runs import Paths, Runs, Warn, load
+from estimator.choices import choice
 from estimator.diagnosis import Diagnosis
 from estimator.diagnosis import diagnose as _diagnose
 from estimator.diagnosis.fourier import Limits
@@ -30,6 +31,7 @@ from estimator.freerun import FreeRun, free_run
 from estimator.harm import Unseen, harm, harm_of_parts
 from estimator.identify import Identified, identify
 from estimator.model import JointModel
+from estimator.reasons import percent
 from estimator.sample import Record
 from estimator.transmissions import RIGID
 
@@ -322,9 +324,12 @@ def fit(
     runs = load(recordings, joint, names=names, strict=strict, warn=warn)
     bandwidth = None if bandwidth_hz is None else 2.0 * math.pi * bandwidth_hz
     try:
-        return Fit(runs, identify(list(runs.records), runs.source.joint.model(), bandwidth), bandwidth)
+        found = identify(list(runs.records), runs.source.joint.model(), bandwidth)
     except EstimatorError as error:
         raise RecordingError(f"{some(runs.paths)}: {error}") from error
+    for name, one in zip(runs.names_of_files, found.recordings, strict=True):
+        _require_explained(name, one.train.relative, choice("unexplained"))
+    return Fit(runs, found, bandwidth)
 
 
 def diagnose(
@@ -363,5 +368,15 @@ def diagnose(
         outcome = _diagnose(list(runs.records), model, bandwidth_hz, held, progress)
     except EstimatorError as error:
         raise RecordingError(f"{runs.named}: {error}") from error
+    _require_explained(runs.named, outcome.validation.after_relative, 1.0)
     validated = None if validation is None else Path(validation).name
     return Diagnosed(replace(runs, notes=told), outcome, validated, held)
+
+
+def _require_explained(named: str, left: float, most: float) -> None:
+    """Refuse to state numbers of a joint that leaves more than so much of the torque's rms."""
+    if left > most:
+        raise RecordingError(
+            f"{named}: whatever its numbers, this joint file leaves {percent(left, 0)} of the motor torque: "
+            "expected a recording of this joint (or its inertias, units and signs are far off)"
+        )

@@ -92,6 +92,7 @@ def identify(
         for i, (motor, one) in enumerate(zip(model.motors, fits, strict=True))
     )
     link, link_std = _link(joint, notes)
+    notes += _believed(joint, model)
     link_effects = model.link_effects
     if all(one.excited for motor, one in zip(model.motors, fits, strict=True) if motor.flexible):
         link_effects = _effects(joint, link_effects, None, notes)
@@ -150,6 +151,20 @@ def _effects(
             Effect(name=name, parameters=values_of, std=std),
         )
     return declared
+
+
+def _believed(joint: JointFit, model: JointModel) -> list[str]:
+    """Say which declared inertias are stated because they are declared: of which the data say less."""
+    fitted, places = joint.fitted, [(f"motor {i + 1}", "motor_inertia", i) for i in range(len(model.motors))]
+    said = [
+        where
+        for where, name, motor in [*places, ("the link", "link_inertia", None)]
+        for j in joint.places((name, motor))
+        if 2.0 * fitted.posterior.covariance[j, j] > fitted.regression.std[j] ** 2
+    ]
+    if not said:
+        return []
+    return [f"the inertia of {' and '.join(said)} is the declared one: these recordings say less about it"]
 
 
 def _shared(joint: JointFit, mine: list[int]) -> tuple[float, float] | None:

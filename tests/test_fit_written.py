@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import diagnosiskit as kit
@@ -19,7 +20,7 @@ import joints
 import numpy as np
 import pytest
 
-from drivelink import jointfile, recording
+from drivelink import analysis, jointfile, recording
 from drivelink.cli import main
 from drivelink.errors import JointFileError
 from drivelink.output.fitreport import _effects
@@ -244,3 +245,27 @@ def test_an_effect_that_was_fitted_is_printed_with_its_interval():
     effect = Effect(name="deflection_offset", parameters={"offset_rad": 1.3e-5}, std={"offset_rad": 4.6e-5})
     (row,) = _effects((effect,), Units(False))
     assert row == ("deflection_offset.offset_rad", "1.3e−5", "9.0e−5", "rad")
+
+
+def test_of_another_joint_no_number_is_stated(folder, tmp_path, monkeypatch, capsys):
+    def of(factor):
+        file = tmp_path / "other.toml"
+        motor = MOTOR.format(inertia=factor * kit.INERTIA, damping=kit.DAMPING, model="polynomial")
+        file.write_text('name = "elbow"\n' + motor)
+        return [str(folder / "clean.csv"), "--joint", str(file), "--out", str(tmp_path)]
+
+    assert main(["fit", *of(1000.0)]) == 3
+    told = capsys.readouterr()
+    assert "expected a recording of this joint" in told.err.splitlines()[-1] and not told.out
+    outcome = SimpleNamespace(validation=SimpleNamespace(after_relative=195.0))
+    monkeypatch.setattr(analysis, "_diagnose", lambda *_: outcome)
+    assert main(["diagnose", *of(1.0)]) == 3
+    assert "leaves 19500 % of the motor torque: expected" in capsys.readouterr().err
+
+
+def test_a_number_that_is_stated_because_it_is_declared_is_said_to_be(folder):
+    record = recording.read(folder / "clean.csv")
+    for factor, said in ((0.2, ["the inertia of motor 1 is the declared one"]), (1.0, [])):
+        motor = MOTOR.format(inertia=factor * kit.INERTIA, damping=kit.DAMPING, model="polynomial")
+        notes = identify(record, jointfile.parse('name = "elbow"\n' + motor).model()).notes
+        assert [one.partition(":")[0] for one in notes if "declared" in one] == said

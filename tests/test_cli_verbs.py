@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from itertools import groupby
@@ -268,3 +270,11 @@ def test_output_that_cannot_be_written_is_one_line_and_a_failure(arguments):
         )
     assert done.returncode == 1 and done.stderr.count("\n") == 1, done
     assert done.stderr.endswith(": standard output: No space left on device\n")
+
+
+def test_an_interrupt_while_modules_are_loaded_prints_no_traceback(tmp_path):
+    stub = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
+    (tmp_path / "argparse.py").write_text(stub)
+    path = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
+    ended = subprocess.run([sys.executable, "-m", "drivelink"], env=path, capture_output=True, timeout=60)
+    assert (ended.returncode, ended.stderr) == (-signal.SIGINT, b"")

@@ -15,6 +15,7 @@ import numpy as np
 from estimator.errors import EstimatorError
 from estimator.priors import PRIORS
 from estimator.ranges import range_of, require_in_range
+from estimator.reasons import counted
 
 __all__ = [
     "HIGHEST_ORDER",
@@ -112,7 +113,10 @@ class Effect:
         for name, value in self.std.items():
             require(name in self.parameters, f"std.{name}: expected the name of one of the parameters")
             expected, got = np.size(self.parameters[name]), np.size(value)
-            require(got == expected, f"std.{name}: expected {expected} number(s) as in parameters, got {got}")
+            require(
+                got == expected,
+                f"std.{name}: expected {counted(expected, 'number')} as in parameters, got {got}",
+            )
             require(bool(np.all(np.asarray(value) >= 0.0)), f"std.{name}: expected 0 or more, got {value}")
 
 
@@ -254,7 +258,8 @@ class JointModel:
         expected = 1 if self.arrangement == "single" else 2
         require(
             len(self.motors) == expected,
-            f'arrangement = "{self.arrangement}": expected {expected} motor(s), got {len(self.motors)}',
+            f'arrangement = "{self.arrangement}": expected {counted(expected, "motor")}, '
+            f"got {len(self.motors)}",
         )
 
     @property

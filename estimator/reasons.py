@@ -75,6 +75,11 @@ def reason_text(
     return f"motor {motor}: {text}" if motor else text
 
 
+def counted(number: int, noun: str) -> str:
+    """Return so many of a thing: "1 row", "2 rows"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def percent(share: float, decimals: int) -> str:
     """Return a share of one in per cent, of four digits at most: "12.01 %", "5621 %"."""
     whole = len(f"{abs(100.0 * share):.0f}")

@@ -243,7 +243,7 @@ def test_accepting_writes_the_file_keeps_the_old_one_and_can_be_undone(friction,
     old = acceptance.accept(offer)
     assert old.read_text() == ELBOW.read_text() and old.name.startswith("elbow-2")
     assert [one.name for one in jointfile.load(path).motor[0].effect][-1] == "coulomb_friction"
-    with pytest.raises(RecordingError, match="nothing to accept: accepted"):
+    with pytest.raises(RecordingError, match="accepted already; drivelink accept"):
         acceptance.proposal(path)
     accepted = path.read_text() + "# by hand"
     path.write_text(accepted)

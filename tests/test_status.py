@@ -86,6 +86,18 @@ def test_the_same_with_other_figures_is_the_same(events, clock, caplog):
     assert sum(event["count"] for event in events.recent()) == 1500
 
 
+def test_the_log_ends_what_it_has_begin_and_nothing_else(events, clock, caplog):
+    for second in range(3600):
+        clock[0] = float(second)
+        events.begin("slow", "it does not keep up")
+        clock[0] += (
+            0.1 if second % 7 else 9.0
+        )  # after a longer time, too, in which an end alone would be news
+        events.end("slow", "it keeps up again")
+    said = [message.partition(" (")[0] for message in caplog.messages]
+    assert 4 < len(said) < 30 and said == ["it does not keep up", "it keeps up again"] * (len(said) // 2)
+
+
 def test_emergencies_with_ever_other_codes_have_a_rate(supervisor, clock, caplog):
     for k in range(4000):
         clock[0] = k * 5e-4

@@ -57,6 +57,7 @@ class EventLog:
         self._joint = ""  # whose events are reported and shown; empty: those of all
         self._recent: deque[tuple[str, dict[str, Any]]] = deque(maxlen=self._KEPT)  # whose, and what
         self._active: dict[str, tuple[str, str]] = {}
+        self._logged: set[str] = set()  # of these, those whose beginning was logged
         self._said: dict[tuple[str, str], _Said] = {}
         self._sources: dict[str, tuple[float, set[str]]] = {}  # when the first of the keys came, and the keys
         self._window = _Window()
@@ -92,13 +93,14 @@ class EventLog:
         """Report that a condition begins; while it holds, only its text is renewed."""
         begins = key not in self._active
         self._active[key] = self._joint, text
-        if begins:
-            self._note(f"{key} begins", text, level)
+        if begins and self._note(f"{key} begins", text, level):
+            self._logged.add(key)
 
     def end(self, key: str, text: str = "") -> None:
-        """Report that a condition has ended."""
+        """Report that a condition has ended; the log has that of what it has begin."""
         if self._active.pop(key, None) is not None and text:
-            self._note(f"{key} ends", text, logging.INFO)
+            self._note(f"{key} ends", text, logging.INFO, quiet=key not in self._logged)
+        self._logged.discard(key)
 
     def keep(self, key: str, holds: bool, text: str, over: str, level: int = logging.WARNING) -> None:
         """Report `text` when a condition begins to hold, `over` when it has ended."""
@@ -131,14 +133,15 @@ class EventLog:
         if window.lines <= self._LINES:
             self._logger.log(level, "%s", text)
 
-    def _note(self, key: str, text: str, level: int) -> None:
+    def _note(self, key: str, text: str, level: int, quiet: bool | None = None) -> bool:
+        """Log and keep an event, or count it if `quiet` (None: by its rate); return whether it is logged."""
         now, text, mine = self._clock(), clean_text(text), (self._joint, key)
         said = self._said.get(mine, _Said({}, -self._QUIET_S, -self._QUIET_S, self._QUIET_S))
-        if 0 <= now - said.logged_s < said.quiet_s:
+        if said.event and (0 <= now - said.logged_s < said.quiet_s if quiet is None else quiet):
             self._said[mine] = said._replace(last_s=now, repeated=said.repeated + 1)
             said.event["text"] = text  # its present numbers
             said.event["count"] += 1
-            return
+            return False
         if len(self._said) > 256:
             self._said.clear()
         event = {"time": now, "text": text, "count": 1}
@@ -148,3 +151,4 @@ class EventLog:
         again = f" (logged once for {said.repeated + 1} occurrences)" if said.repeated else ""
         self._log(level, text + again, now)
         self._recent.append((self._joint, event))
+        return True

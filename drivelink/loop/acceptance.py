@@ -67,8 +67,12 @@ def proposal(path: Path) -> Proposal:
         )
     recording, found = newest
     if found["state"] != finding.PROPOSED:
-        state = "" if found["state"] == finding.NOTHING else f"{found['state']}: "
-        raise RecordingError(f"{recording.name}: nothing to accept: {state}{found['sentence']}")
+        state, said = found["state"], f"nothing to accept: {found['sentence']}"
+        if state == finding.ACCEPTED:
+            said = f"accepted already; drivelink accept {path} --undo puts the old joint file back"
+        elif state != finding.NOTHING:
+            said = f"nothing to accept, {state}: {found['sentence']}"
+        raise RecordingError(f"{recording.name}: {said}")
     if found.get("joint_file") != finding.fingerprint(source.text):
         raise RecordingError(
             f"{path}: has changed since {recording.name} was kept: expected the same joint file; "

@@ -29,6 +29,7 @@ from drivelink.recording.limits import (
     too_many_records,
     whole_lines,
 )
+from estimator.reasons import counted
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -194,8 +195,8 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
     if not understood or strange > understood + _HOPELESS:
         raise RecordingError(f"{path}: expected lines as candump writes them, got {first_strange or 'none'}")
     if strange:
-        text = "%s: %d line(s) are not CAN frames and are omitted, first %s"
-        _LOG.warning(text, path, strange, first_strange)
+        text = "%s: omitted: %s without a CAN frame, first %s"
+        _LOG.warning(text, path, counted(strange, "line"), first_strange)
 
 
 def _frame(line: bytes) -> LoggedFrame | None:

@@ -31,6 +31,7 @@ from drivelink.recording.grid import (
 )
 from drivelink.recording.limits import require_samples
 from estimator.errors import EstimatorError
+from estimator.reasons import counted
 from estimator.sample import FloatArray, Record, Sample
 
 
@@ -193,7 +194,7 @@ def record_from_columns(
     """
     columns = {**columns, **dict.fromkeys(ignored, np.empty(0))}
     if unknown := [name for name in columns if name and name not in COLUMNS]:
-        _LOG.warning("%s: ignored column(s) %s", where, some(unknown, 40))
+        _LOG.warning("%s: ignored columns: %s", where, some(unknown, 40))
     factors = joint.recording.scale if joint else {}
     columns = {name: x * factors[name] if name in factors else x for name, x in columns.items()}
     table = _Table(columns, where, joint)
@@ -363,7 +364,7 @@ def _usable(needed: Sequence[FloatArray], where: str) -> NDArray[np.bool_]:
     """
     usable: NDArray[np.bool_] = np.all(np.isfinite(needed), axis=0)
     if lost := int(np.count_nonzero(~usable)):
-        _LOG.warning("%s: %d row(s) with missing values are taken as gaps", where, lost)
+        _LOG.warning("%s: taken as gaps: %s with missing values", where, counted(lost, "row"))
     if int(np.count_nonzero(usable)) < 3:
         raise RecordingError(f"{where}: expected at least 3 complete samples, got {np.count_nonzero(usable)}")
     return usable

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from drivelink.cycle.syncclock import slope_of
 from drivelink.errors import RecordingError
+from estimator.reasons import counted
 from estimator.sample import FloatArray
 
 _LOG = logging.getLogger("drivelink.recording")
@@ -63,9 +64,9 @@ def find_grid(
     """
     keep = np.isfinite(time_s)
     if missing := int(np.count_nonzero(~keep)):
-        _LOG.warning("%s: %d row(s) without a time stamp are taken as gaps", where, missing)
+        _LOG.warning("%s: taken as gaps: %s without a time stamp", where, counted(missing, "row"))
     if repeats is not None and (repeated := int(np.count_nonzero(repeats & keep))):
-        _LOG.warning("%s: %d row(s) repeat the row before and are omitted", where, repeated)
+        _LOG.warning("%s: omitted: %s equal to the row before", where, counted(repeated, "row"))
         keep &= ~repeats
     time = time_s[keep]
     if np.any(np.abs(time) > _LAST_S):
@@ -92,9 +93,9 @@ def report_gaps(sequence: NDArray[np.int64], period_s: float, where: str) -> Non
     gaps = steps > 1
     if np.any(gaps):
         _LOG.warning(
-            "%s: %d gap(s), %d of %d samples missing, the longest %.6g s at %.6g s",
+            "%s: %s, %d of %d samples missing, the longest %.6g s at %.6g s",
             where,
-            int(np.count_nonzero(gaps)),
+            counted(int(np.count_nonzero(gaps)), "gap"),
             int(np.sum(steps[gaps] - 1)),
             int(sequence[-1] - sequence[0] + 1),
             (int(steps.max()) - 1) * period_s,
@@ -107,9 +108,9 @@ def _require_forward(steps: FloatArray, rows: NDArray[np.int64], time: FloatArra
     if len(backwards):
         k = int(backwards[0])
         raise RecordingError(
-            f"{where}: time_s runs backwards {len(backwards)} time(s), first at sample {rows[k + 1] + 1} "
-            f"({time[k]:.9g} s to {time[k + 1]:.9g} s): expected increasing stamps (two recordings joined, "
-            "or the clock was set?)"
+            f"{where}: time_s runs backwards {counted(len(backwards), 'time')}, first at sample "
+            f"{rows[k + 1] + 1} ({time[k]:.9g} s to {time[k + 1]:.9g} s): expected increasing stamps "
+            "(two recordings joined, or the clock was set?)"
         )
 
 

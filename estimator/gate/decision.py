@@ -15,7 +15,7 @@ from estimator.gate.balance import Balance, Fit, Scales
 from estimator.gate.causes import Cause, Change, Kind, causes, scales
 from estimator.model import JointModel, Motor
 from estimator.priors import PRIORS
-from estimator.reasons import percent
+from estimator.reasons import counted, percent
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import transmission_model
 
@@ -219,7 +219,9 @@ def judge(record: Record, model: JointModel) -> Judgement:
         EstimatorError: the recording has other motors than the model.
     """
     if record.motors != len(model.motors):
-        raise EstimatorError(f"recording: expected {len(model.motors)} motor(s), got {record.motors}")
+        raise EstimatorError(
+            f"recording: expected {counted(len(model.motors), 'motor')}, got {record.motors}"
+        )
     if len(record) < whole("samples"):
         return Judgement(reason=f"{len(record)} samples, expected at least {whole('samples')}")
     joint = _Joint(record, model, _balances(record, model))

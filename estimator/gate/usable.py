@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimator.choices import choice, whole
 from estimator.errors import EstimatorError
 from estimator.model import JointModel
-from estimator.reasons import percent
+from estimator.reasons import counted, percent
 from estimator.sample import FloatArray, Record
 
 __all__ = ["at_limit", "check", "is_held", "without_hold"]
@@ -35,7 +35,7 @@ def check(record: Record, model: JointModel) -> None:
         )
     if record.motors != len(model.motors):
         raise EstimatorError(
-            f"the recording has {record.motors} motor(s): expected {len(model.motors)} motor(s), "
+            f"the recording has {counted(record.motors, 'motor')}: expected {len(model.motors)}, "
             "as in the joint file"
         )
     if model.has_deflection and record.link_position_rad is None:

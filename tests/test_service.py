@@ -121,6 +121,18 @@ def test_systemd_finds_the_unit_right_and_little_exposed(tmp_path, interface, ch
     assert level is not None and float(level[1]) <= 1.4
 
 
+def test_a_black_box_is_written_where_the_joint_file_says(joint, tmp_path):
+    """Confined under a user of its own the service could write nowhere: nothing was ever kept."""
+    joint.write_text(joint.read_text() + '\n[recording]\nfolder = "kept"\n')
+    assert service("install", joint, "--root", tmp_path / "root") == 0
+    unit = (tmp_path / "root" / UNIT).read_text()
+    assert f"\nBindPaths={tmp_path}/kept\n" in unit and (tmp_path / "kept").is_dir()
+    owner = tmp_path.stat()
+    command = ["systemd-analyze", "verify", "--man=no", str(tmp_path / "root" / UNIT)]
+    assert shutil.which(command[0]) is None or subprocess.run(command, check=False).returncode == 0
+    assert f"\nUser={owner.st_uid}\nGroup={owner.st_gid}\n" in unit and "DynamicUser" not in unit
+
+
 def test_a_service_that_is_stopped_waits_for_its_black_box(tmp_path, monkeypatch):
     """It writes what is pending for up to a minute; the unit's limit is five seconds."""
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))

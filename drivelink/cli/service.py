@@ -13,7 +13,7 @@ from pathlib import Path
 from drivelink import jointfile
 from drivelink.cli import add_bus, moved
 from drivelink.errors import DrivelinkError, UsageError
-from drivelink.systemd.unit import UNITS, installation, network_files, unit_name
+from drivelink.systemd.unit import UNITS, installation, kept_in, network_files, unit_name
 
 EPILOG = """\
 Writes the unit drivelink@NAME.service, and for a SocketCAN interface the files with which systemd-networkd
@@ -75,6 +75,10 @@ def _install(args: argparse.Namespace, root: Path) -> int:
             raise UsageError(f"{there}: exists already and differs; --force replaces it")
     if args.root is None:
         _systemctl("daemon-reload")  # without systemd nothing is written
+    if (kept := kept_in(joint, path)) is not None and not kept.exists():
+        kept.mkdir(parents=True)
+        owner = path.absolute().parent.stat()
+        os.chown(kept, owner.st_uid, owner.st_gid)
     for place, text in made.files.items():
         (root / place).parent.mkdir(parents=True, exist_ok=True)
         (root / place).write_text(text, encoding="utf-8")

@@ -70,7 +70,14 @@ def installation(
     interface, channel = joint.bus.interface, joint.bus.channel
     _check_bus(interface, channel, path)
     can, serial = interface == "socketcan", interface in _SERIAL
-    seen = _below_home([path.parent, executable.parent, *_python()])
+    seen = [
+        f"BindReadOnlyPaths={_plain(p)}" for p in _below_home([path.parent, executable.parent, *_python()])
+    ]
+    whose, user, kept = "A user of its own", "DynamicUser=yes", kept_in(joint, path)
+    if kept is not None:  # its owner keeps, reads and accepts there
+        seen.append(f"BindPaths={_plain(kept)}")
+        owner = path.parent.stat()
+        whose, user = "The joint folder's owner", f"User={owner.st_uid}\nGroup={owner.st_gid}"
     escaped = channel.replace("-", "\\x2d")  # in the name of a unit
     values = {
         "name": joint.name,
@@ -78,7 +85,9 @@ def installation(
         "executable": _plain(executable),
         "joint": " ".join((_plain(path), *map(_plain, bus))),
         "folder": _plain(path.parent),
-        "paths": "\n".join(f"BindReadOnlyPaths={_plain(place)}" for place in seen),
+        "paths": "\n".join(seen),
+        "whose": whose,
+        "user": user,
         "devices": "DeviceAllow=char-ttyACM rw\nDeviceAllow=char-ttyUSB rw\nSupplementaryGroups=dialout"
         if serial
         else "PrivateDevices=yes",
@@ -93,6 +102,12 @@ def installation(
     if can:
         written |= _network(channel, joint.bus.bitrate)
     return Installation(unit, written)
+
+
+def kept_in(joint: JointFile, path: Path) -> Path | None:
+    """Return the folder of a joint's black box, which the service writes to; None: it has none."""
+    folder = joint.recording.folder
+    return None if folder is None else Path(os.path.normpath(path.absolute().parent / folder))
 
 
 def _check_bus(interface: str, channel: str, path: Path) -> None:

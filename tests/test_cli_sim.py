@@ -65,7 +65,9 @@ def test_simulations_and_masters_share_the_bus_over_tcp_and_sigterm_ends_the_fir
         assert "node 1, node 2, node 3: on the bus already: another `drivelink sim`" in said[1]
         with process("sim", file, "--channel", "vcan1") as elsewhere:
             said = elsewhere.communicate(timeout=PATIENCE_S)[1]
-            assert "vcan1 cannot be opened: the server has no bus of this name" in said
+            assert (
+                "vcan1 cannot be opened: its server has no bus of this name; give this bus a server" in said
+            )
         drives.send_signal(signal.SIGTERM)
         assert drives.wait(PATIENCE_S) == 0 and drives.stderr.read() == ""
         assert joined.wait(PATIENCE_S) == 4

@@ -190,7 +190,7 @@ def test_every_verb_that_reads_takes_the_mapping_and_needs_a_joint(verb, declare
     recording = str(theirs(tmp_path / "rig.csv"))
     assert cli.main([verb, recording, "--joint", str(joint), *options, *out]) == 0, capsys.readouterr().err
     assert cli.main([verb, recording]) == 2  # it carries none
-    assert "--joint: expected the joint file that" in capsys.readouterr().err
+    assert "expected --joint FILE, the joint file that it was recorded with" in capsys.readouterr().err
 
 
 def test_fit_takes_the_joint_from_a_recording_that_carries_it(tmp_path, capsys):

@@ -443,7 +443,7 @@ def test_a_diagnosis_that_waits_for_the_processors_says_so(tmp_path, monkeypatch
         monkeypatch.setattr("drivelink.loop.queue._of_process", lambda _, one=(state, cpu_s): one)
         diagnoses.step()
         said.append(finding.line(finding.read(made) or {}))
-    waits = "diagnosis waits: processors busy since 10 s"
+    waits = "diagnosis waits: processors busy for 10 s"
     assert said[5] == said[-1] == "what the model may lack is being looked for"
     assert waits in said[12] and waits not in said[25] and len(set(said)) == 2
     assert _of_process(os.getpid())[0] == "R"

@@ -226,7 +226,7 @@ def _reason(error: BaseException) -> str:
             return _REASONS[number]
         cause = cause.__cause__ or cause.__context__
     if "could not open bus" in str(error):  # socketcand's answer
-        return "the server has no bus of this name"
+        return "its server has no bus of this name; give this bus a server of its own by bus.options (port)"
     return one_line(str(error)) or type(error).__name__
 
 

@@ -61,6 +61,11 @@ ALONE = (
     "with --interface socketcand, `drivelink sim` and `drivelink run` meet over TCP"
 )
 _INTERRUPTED = 130
+_OPTIONS = {
+    "force=True": "--force",
+    "joint=FILE": "--joint FILE",
+    "names: ": "--map: ",
+}  # as errors name them
 
 
 _EPILOG = """\
@@ -171,7 +176,9 @@ def _main(argv: list[str] | None) -> int:
             getattr(args, "parser", parser).error(f"unrecognized arguments: {' '.join(unknown)}")
         return int(args.run(args))
     except DrivelinkError as error:
-        said = str(error).replace("force=True", "--force")  # as in Python
+        said = str(error)
+        for in_python, option in _OPTIONS.items():
+            said = said.replace(in_python, option)
         return _fail(verb, f"{said}{_instead_of_a_name(error)}", error.exit_status)
     except EstimatorError as error:
         return _fail(verb, error, 1)

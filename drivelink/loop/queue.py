@@ -86,7 +86,7 @@ class Diagnoses:
         waited_s -= waited_s % _SAID_S
         if waited_s != self._said_s:
             self._said_s = waited_s
-            waits = f"diagnosis waits: processors busy since {waited_s:.0f} s"
+            waits = f"diagnosis waits: processors busy for {waited_s:.0f} s"
             self._say(finding.DIAGNOSING, waits if waited_s else _UNDER_WAY)
 
     def _end(self, status: int) -> None:

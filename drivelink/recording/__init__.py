@@ -56,7 +56,7 @@ def read(
         left = tuple(name for name in ignored if name not in ours)
         return record_from_columns(ours, str(path), joint, keep_nan, left)
     if names:
-        raise UsageError(f"--map: {path}: only CSV files have columns to be named")
+        raise UsageError(f"names: {path}: only CSV files have columns to be named")
     if is_frame_log(path):
         return read_frame_record(path, joint, Path(base_dir), channel)
     if joint is not None:

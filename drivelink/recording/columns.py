@@ -50,7 +50,7 @@ ColumnMap = Mapping[str, Source]
 
 
 def parse_column_map(texts: Sequence[str]) -> ColumnMap:
-    """Parse `--map` options `SOURCE=COLUMN[:UNIT]`; a number as unit is a factor.
+    """Parse the `names` of columns `SOURCE=COLUMN[:UNIT]`; a number as unit is a factor.
 
     Raises:
         UsageError: another form.
@@ -61,15 +61,15 @@ def parse_column_map(texts: Sequence[str]) -> ColumnMap:
         name, _, unit = target.partition(":")
         if not equals or not source.strip() or name not in COLUMNS:
             raise UsageError(
-                f"--map: expected SOURCE=COLUMN[:UNIT] like q_link=link_position_rad:deg, with COLUMN one of "
+                f"names: expected SOURCE=COLUMN[:UNIT] like q_link=link_position_rad:deg, with COLUMN one of "
                 f"{', '.join(sorted(COLUMNS))}; got {text[:80]!r}"
             )
         if name in found:
-            raise UsageError(f"--map: {name} is given twice, as {found[name].column[:80]} and {source[:80]}")
+            raise UsageError(f"names: {name} is given twice, as {found[name].column[:80]} and {source[:80]}")
         try:
             found[name] = Source(source.strip(), si_factor(name, unit), unit=unit)
         except ValueError as error:
-            raise UsageError(f"--map: {name}: {error}") from error
+            raise UsageError(f"names: {name}: {error}") from error
     return found
 
 

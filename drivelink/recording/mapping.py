@@ -108,7 +108,7 @@ def joint_of(path: Path, named: Path | None) -> JointText:
     elif path.suffix.lower() in CAN_SUFFIXES:
         carried = _read_side(path)
     if carried is None:
-        raise UsageError(f"--joint: expected the joint file that {path} was recorded with")
+        raise UsageError(f"{path}: expected joint=FILE, the joint file that it was recorded with")
     try:
         if len(carried) > MAX_BYTES:
             raise ValueError(f"expected at most {MAX_BYTES >> 10} KiB, got {len(carried) >> 10} KiB")

@@ -12,6 +12,7 @@ from daemonkit import served, vsa_text
 from zenohkit import free_endpoint, free_port, process, until
 
 from drivelink.cli import main
+from drivelink.daemon.service import Daemon
 from drivelink.jointfile import load
 from drivelink.plaintext import stamped
 from drivelink.pubsub.client import subscribe
@@ -68,6 +69,19 @@ def test_run_ends_after_its_seconds_and_prints_two_objects_of_json(tmp_path, cap
     assert (ready["event"], ready["joints"], ready["rate_hz"]) == ("ready", ["elbow"], 50.0)
     (status,) = end["joints"]
     assert (end["event"], status["joint"]) == ("end", "elbow")
+
+
+def test_a_full_disk_under_what_is_printed_ends_no_daemon(tmp_path, capsys, monkeypatch):
+    path, ran = tmp_path / "elbow.toml", []
+    path.write_text(vsa_text(endpoint=free_endpoint(), bus="period_s = 0.02"), encoding="utf-8")
+    monkeypatch.setattr(Daemon, "run", lambda _, seconds: ran.append(seconds))
+    with served(load(path)), Path("/dev/full").open("w") as full:
+        monkeypatch.setattr("sys.stdout", full)
+        assert main(["run", str(path), "--no-realtime", "--seconds", "0.4"]) == 1
+    assert ran == [0.4]
+    assert (
+        capsys.readouterr().err.splitlines()[-1] == "drivelink run: standard output: No space left on device"
+    )
 
 
 def test_a_drive_that_does_not_answer_is_one_line(tmp_path, capsys, monkeypatch):

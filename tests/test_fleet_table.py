@@ -329,10 +329,12 @@ def test_the_examples_of_the_documentation_read_the_table(tmp_path, monkeypatch,
     ["javascript:alert(1)", "https://evil.example/report.html", "diagnoses/../../x/report.html", "//x"],
 )
 def test_the_table_is_data_on_the_page(report):
-    rows = [night("elbow", k, 150.0, ["coulomb_friction@motor"]) for k in range(8)]
+    mark = "<script>alert(1)</script>"
+    rows = [night(mark, k, 150.0, [f"{mark}@{mark}"]) for k in range(9)]
     good = "diagnoses/elbow/0123456789abcdef01234567-2/report.html"
     for one in rows:
-        one |= {"report": report, "sentence": "<script>alert(1)</script>"}
+        one |= {"report": report, "sentence": mark, "verdict": mark, "recording": mark, "model": mark}
+    rows[0] |= {"status": "error", "error": mark}
     rows[-1]["report"] = good
     text = page(summarise(rows, 0.05))
     assert report not in text and "<script" not in text

@@ -446,13 +446,21 @@ def test_a_file_with_too_many_frames_is_refused_where_it_has_them(tmp_path):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("cob_id", 1 << 40), ("motor", -1), ("scale", 0.0), ("scale", math.inf), ("bits", 65), ("modulus", -1)],
+    [
+        ("cob_id", 1 << 40),
+        ("motor", -1),
+        ("scale", 0.0),
+        ("scale", math.inf),
+        ("bits", 65),
+        ("modulus", -1),
+        ("transmission_type", 256),
+    ],
 )
 def test_a_layout_that_no_node_has_is_one_line(key, value, tmp_path):
     """Its numbers were those that the compiled core takes, or a traceback."""
     mapped = {"signal": "other", "index": 0x6064, "subindex": 0, "bits": 32, "signed": True}
     mapped |= {"scale": 1.0, "modulus": 0}
-    tpdo = {"cob_id": 0x181, "objects": [mapped]}
+    tpdo = {"cob_id": 0x181, "transmission_type": 1, "objects": [mapped]}
     node = {"node_id": 1, "motor": 0, "tpdos": [tpdo]}
     next(part for part in (mapped, tpdo, node) if key in part)[key] = value
     path = tmp_path / "r.log"

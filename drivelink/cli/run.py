@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -87,7 +87,8 @@ def run(args: argparse.Namespace) -> int:
         section = joints[0].joint.bus
         for served in joints:
             stack.enter_context(black_box(served.joint, served.path))
-        _say_ready([served.joint.name for served in joints], section, args)
+        with suppress(OSError):  # a full disk under what is printed: said at the end, and ends no daemon
+            _say_ready([served.joint.name for served in joints], section, args)
         ended = threading.Event()
         if sys.stdout.isatty() and not args.json:
             threading.Thread(target=_show, args=(daemon, ended), daemon=True).start()

@@ -148,6 +148,10 @@ class JointFit(NamedTuple):
         mine = self.places(key)
         return np.zeros(len(mine)) if key in self.absent else _totals(self.fitted)[mine]
 
+    def supports(self, key: Key) -> bool:
+        """Return whether the data support an everyday error beyond the declared value."""
+        return key not in self.absent and _odds_of_zero(self, [key]) <= log_odds(choice("even"))
+
     def mean(self, name: str, motor: int | None) -> tuple[float, float]:
         """Return an error and its standard deviation, the mean of the recordings where each has its own."""
         mine = self.places((name, motor))

@@ -135,7 +135,7 @@ def _effects(
     flexible = motor is None or joint.problem.model.motors[motor].flexible
     for name, parameter in _PARAMETER.items():
         mine = joint.places((name, motor))
-        if not mine or (name, motor) in joint.absent or (flexible and name == "coulomb_friction"):
+        if not mine or not joint.supports((name, motor)) or (flexible and name == "coulomb_friction"):
             continue
         more = _shared(joint, mine)
         if more is None:

@@ -25,7 +25,7 @@ from estimator.diagnosis.curves import _bases
 from estimator.diagnosis.findings import rivals_of
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.order import bends
-from estimator.diagnosis.probabilities import chances, standing
+from estimator.diagnosis.probabilities import believed, chances, standing
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Rival
 from estimator.diagnosis.search import Search
@@ -86,6 +86,29 @@ def test_each_candidate_has_one_probability_whoever_names_it():
         stands = standing(found, k, beside, chance)
         assert stands.probability == pytest.approx(own)
         assert stands.alternatives == (("gravity", chance["gravity", 0]),)
+
+
+@pytest.mark.parametrize(("share", "reported"), [(0.1, "coulomb_friction"), (0.7, "stribeck_friction")])
+def test_a_law_is_reported_unless_a_simpler_one_of_the_phenomenon_is_more_probable(share, reported):
+    """What is written is what is named, at the probability that is stated; another phenomenon has its own."""
+
+    def account(name: str, family: str, parameters: int, score: float) -> Any:
+        keys = frozenset({(name, 0)})
+        return SimpleNamespace(
+            keys=keys,
+            named=keys,
+            terms=[name],
+            families=frozenset({family}),
+            parameters=parameters,
+            score=score,
+        )
+
+    found = account("stribeck_friction", "friction", 4, share)
+    simpler, other = account("coulomb_friction", "friction", 2, 0.2), account("cogging", "ripple", 3, 0.6)
+    held: Any = SimpleNamespace(
+        scores=lambda one: one.score, weights=lambda every, _: np.array([one.score for one in every])
+    )
+    assert believed(held, found, [simpler, other]).keys == {(reported, 0)}
 
 
 def test_a_further_ripple_is_listed_by_the_name_of_its_kind():

@@ -14,6 +14,7 @@ from estimator.batch import fit, fit_joint
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.problem import Problem
+from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
 from estimator.harm import Unseen, _Figure, harm, harm_of_parts
@@ -106,6 +107,13 @@ def test_a_larger_motion_alone_is_no_error_of_the_model_and_too_short_data_are_r
     assert held_out(problem, small).surplus(problem.null()) == 1.0
 
 
+def test_a_zero_within_its_own_uncertainty_is_none_of_the_machine(model):
+    """Another recording, whose encoders began elsewhere, is not moved by it."""
+    found = identify(record(SOFT), model)
+    assert abs(found.fits[0].deflection_offset_rad) < found.fits[0].nuisance_std["shift"]
+    assert found.model.motors[0].effects == ()
+
+
 def test_fit_widens_by_what_each_recording_shows_when_left_out(model):
     """Together they are fitted by the mean stiffness: half of the difference is left in each."""
     records = [record(SOFT), record(STIFF)]
@@ -138,6 +146,21 @@ def test_errors_beyond_the_residual_widen_what_the_data_tell_not_what_is_declare
     before, after = (np.diag(hac_covariance(problem, fitted, surplus)) for surplus in (1.0, 4.0))
     assert after[0] == pytest.approx(4.0 * before[0], rel=0.02)
     assert after[inertia] == pytest.approx(before[inertia], rel=1e-3)
+
+
+@pytest.mark.parametrize(("name", "said"), [("torque_drift", True), ("coulomb_friction", False)])
+def test_an_effect_on_a_reading_is_as_improbable_as_it_is_far_off(name, said, model):
+    """A torque scale that changes by half within seconds is none; friction's prior is a share of the torque."""
+    search = Search(Problem([record(SOFT)], model, BANDWIDTH_HZ))
+    found = search.with_effect(search.null, name, 0)
+    assert found is not None
+    (mine,) = (j for j, slot in enumerate(found.slots) if slot.kind == "term")
+    prior = []
+    for off in (0.0, 5.0):
+        x = found.posterior.x.copy()
+        x[mine] = found.regression.mean[mine] + off * found.regression.std[mine]
+        prior.append(replace(found, posterior=found.posterior._replace(x=x)).log_prior(50.0, 1.0))
+    assert prior[0] - prior[1] == pytest.approx(12.5 if said else 0.0)
 
 
 def test_a_file_that_explains_less_than_the_declared_one_is_not_written(healthy):

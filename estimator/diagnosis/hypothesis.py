@@ -13,6 +13,7 @@ from estimator.diagnosis.design_matrix import Extra, Pinned, Slot, Term
 from estimator.diagnosis.frame import Corrections, Frame
 from estimator.diagnosis.law_parameters import Base
 from estimator.diagnosis.regression import Posterior, Regression
+from estimator.effects import LIBRARY
 from estimator.sample import FloatArray
 
 __all__ = ["Fitted", "Keys"]
@@ -94,11 +95,11 @@ class Fitted:
     def log_prior(self, errors: float, price: float) -> float:
         """Return the logarithm of the prior odds of such a joint, beside one as declared.
 
-        Each declared number and reading is as improbable as it is far off. Each effect pays for multiple
-        testing (Scott and Berger, Annals of Statistics 38, 2010), each of its parameters half the logarithm
-        of the number of independent errors (Schwarz, Annals of Statistics 6, 1978).
+        Each declared number and reading is as improbable as it is far off, as an effect too. Each effect
+        pays for multiple testing (Scott and Berger, Annals of Statistics 38, 2010), each of its parameters
+        half the logarithm of the number of independent errors (Schwarz, Annals of Statistics 6, 1978).
         """
-        off = np.array([off for slot, off in self._off() if slot.kind == "everyday"])
+        off = np.array([off for slot, off in self._off() if slot.kind == "everyday" or _is_read(slot)])
         effects = price * len(self.keys) + 0.5 * self.parameters * math.log(max(errors, 1.0))
         return -0.5 * float(off @ off) - effects
 
@@ -133,3 +134,8 @@ class Fitted:
             for slot, x in zip(self.slots, self.posterior.x, strict=True)
             if (slot.kind, slot.name, slot.motor) == (kind, name, motor) and slot.run in (None, run)
         ]
+
+
+def _is_read(slot: Slot) -> bool:
+    """Return whether a column is an effect's on a reading, whose prior is not a share of the torque."""
+    return slot.kind == "term" and LIBRARY[slot.name].channel != "torque"

@@ -41,9 +41,17 @@ def accounts(held: Held, found: Fitted, others: Sequence[Fitted]) -> list[tuple[
 
 
 def believed(held: Held, found: Fitted, others: Sequence[Fitted]) -> Fitted:
-    """Return the hypothesis without the effects that are less probable than their absence."""
+    """Return the most probable of the hypothesis and simpler ones.
+
+    Simpler is one without some of its effects, or with laws of the same phenomena that have fewer parameters.
+    """
+
+    def simpler(one: Fitted) -> bool:
+        fewer = one.families <= found.families and one.parameters < found.parameters
+        return fewer or one.named <= found.named
+
     every = accounts(held, found, others)
-    return max((pair for pair in every if pair[1].named <= found.named), key=lambda pair: pair[0])[1]
+    return max((pair for pair in every if simpler(pair[1])), key=lambda pair: pair[0])[1]
 
 
 def chances(found: Fitted, beside: Sequence[tuple[float, Fitted]], alike: Sequence[Twin] = ()) -> Chances:

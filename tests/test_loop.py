@@ -185,6 +185,19 @@ def test_a_full_disk_is_a_line_of_the_diagnosis_too(tmp_path, monkeypatch, caplo
     assert said == f"elbow: {finding_file(made)}: cannot be written: No space left on device"
 
 
+def test_a_diagnosis_is_one_line_in_the_daemons_log(tmp_path):
+    """Not also two about the gaps of its recording, of samples and of frames."""
+    made, source = tmp_path / "elbow-20260105T081500Z-asked.mcap", jointfile.load_text(ELBOW)
+    sink = McapSink(made, source.joint, source.text)
+    moved = np.linspace(0.0, 0.1, 40)
+    for sample in joints.part(joints.recorded(moved, moved, moved), np.arange(40) % 7 > 0).samples():
+        sink.sample(sample, STAMP_NS + sample.sequence * 1_000_000)
+    sink.close()
+    command = [sys.executable, "-m", "drivelink.loop.diagnosing", str(made)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert "not diagnosed" in done.stderr and len(done.stderr.splitlines()) == 1
+
+
 def touch(folder: Path, *events: str) -> list[Path]:
     paths = [folder / f"elbow-20260105T{event}.mcap" for event in events]
     for path in paths:

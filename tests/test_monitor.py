@@ -208,6 +208,7 @@ def test_unobservable_estimates_leave_the_curve_as_it_is_and_a_daemon_that_start
         (5.1e-5, 0.027, "0.000 ± 0.027"), (0.0974198, 0.0064, "0.0974 ± 0.0064"), (-1e-9, 3e-9, "−1.0e−9 ± 3.0e−9"),
         (123456.0, 1234.0, "123500 ± 1200"), (9.96, 0.0996, "9.96 ± 0.10"), (150.0, math.nan, "150.0"),
         (math.nan, 1.0, "–"), (9.96e-5, 4.4e-5, "1.00e−4 ± 0.44e−4"), (-0.001, 0.5, "0.00 ± 0.50"),
+        (-0.0, None, "0.000"),
     ],
 )  # fmt: skip
 def test_numbers_are_short_and_their_digits_follow_the_uncertainty(value, half, text):

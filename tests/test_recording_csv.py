@@ -115,6 +115,14 @@ def test_rows_with_nan_are_gaps_for_a_fit_and_rows_for_a_replay(tmp_path, said):
     assert len(kept) == 50 and np.isnan(kept.motor_position_rad[20, 0])
 
 
+def test_lines_that_end_with_carriage_returns_alone_are_said(tmp_path):
+    """They were one long line, or "no text"."""
+    path = write(tmp_path / "r.csv", rows())
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r"))
+    with one_line("", "line 1: expected a line feed at its end, got carriage returns alone"):
+        read(path)
+
+
 def test_repeated_stamps_are_left_out_and_reported(tmp_path, said):
     table = np.insert(rows(), 10, rows()[9], axis=0)
     record = read(write(tmp_path / "r.csv", table))

@@ -247,4 +247,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    logging.getLogger("drivelink.recording").setLevel(
+        logging.ERROR
+    )  # the daemon said what was missing as it was
     sys.exit(main())

@@ -12,6 +12,7 @@ def number(value: float, digits: int = 4) -> str:
     """Return a number with so many significant digits; very large and small ones like 4.1e6."""
     if not math.isfinite(value):
         return "–"
+    value += 0.0  # no negative zero
     if value != 0.0 and not 1e-3 <= abs(value) < 1e5:
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
         return f"{mantissa}e{int(exponent)}".replace("-", "−")

@@ -77,7 +77,7 @@ def whole_lines(file: IO[bytes], path: Path, number: int = 1) -> Iterator[bytes]
     """Yield the lines of a text from a number on, without a last one that has no end, and padding after it.
 
     Raises:
-        RecordingError: a line is too long.
+        RecordingError: a line is too long, or ends with no line feed.
     """
     padded = False  # after a power loss
     while line := file.readline(MAX_LINE_BYTES + 1):
@@ -86,6 +86,10 @@ def whole_lines(file: IO[bytes], path: Path, number: int = 1) -> Iterator[bytes]
             yield line
         elif not line.strip(b"\0"):
             padded = True
+        elif b"\r" in line.rstrip():
+            raise RecordingError(
+                f"{path}: line {number}: expected a line feed at its end, got carriage returns alone"
+            )
         elif padded or len(line) > MAX_LINE_BYTES:
             raise RecordingError(f"{path}: line {number}: expected at most {MAX_LINE_BYTES >> 10} KiB")
         elif line.strip(b" \t\r\0"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import shutil
 import urllib.error
@@ -96,7 +97,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, caplog):
     assert len(day.rows(folder, "elbow")) == 1
 
 
-def test_the_page_links_events_to_recording_and_diagnosis(tmp_path):
+def test_the_page_links_events_to_recording_and_diagnosis(tmp_path, monkeypatch):
     Written(tmp_path).run(200)
     recording = kept_one(tmp_path)
     (tmp_path / "secret.toml").write_text("x")
@@ -127,6 +128,9 @@ def test_the_page_links_events_to_recording_and_diagnosis(tmp_path):
         for path in (finding, "kept/secret.toml", "kept/..%2Fsecret.toml", "kept/", "day/x"):
             with pytest.raises(urllib.error.HTTPError, match="404"):
                 get(path)
+        monkeypatch.setattr(Path, "is_symlink", lambda _: False)  # it was none when it was looked at
+        with pytest.raises(http.client.RemoteDisconnected):
+            get(finding)
         with pytest.raises(urllib.error.HTTPError):
             get("day.json", Sec_Fetch_Site="cross-site")
     finally:

@@ -13,6 +13,7 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import joints
 import numpy as np
@@ -446,7 +447,8 @@ def test_only_the_page_itself_can_accept(friction, tmp_path):
 
 def test_a_diagnosis_that_waits_for_the_processors_says_so(tmp_path, monkeypatch):
     (made,) = touch(tmp_path, "081500Z-model-alarm")
-    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: SimpleNamespace(poll=lambda: None, pid=1))
+    process = SimpleNamespace(poll=lambda: None, pid=1, kill=MagicMock())
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: process)
     diagnoses, now_s, said = Diagnoses(tmp_path, "elbow"), 100.0, []
     monkeypatch.setattr("drivelink.loop.queue.time.monotonic", lambda: now_s)
     cpu_s = 0.0
@@ -466,7 +468,10 @@ def test_a_diagnosis_that_waits_for_the_processors_says_so(tmp_path, monkeypatch
     for _ in range(20):
         now_s += 1.0
         diagnoses.step()
-    assert finding.line(finding.read(made)) == "the model is sufficient"
+    assert finding.line(finding.read(made)) == "the model is sufficient" and not process.kill.called
+    now_s += 3600.0  # nor may one take the processors for ever
+    diagnoses.step()
+    assert process.kill.called
 
 
 def test_what_lies_in_the_folder_is_no_program(tmp_path):

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import MagicMock
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
@@ -155,6 +156,13 @@ def test_ctrl_c_while_the_workers_start_is_one_line(fleet, tmp_path):
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
     assert error.splitlines()[-1].startswith("interrupted") and "Traceback" not in error, error
+
+
+def test_a_process_that_is_killed_as_it_starts_is_one_line(monkeypatch):
+    """By the kernel, for want of memory: it was a traceback of Dask's."""
+    monkeypatch.setattr(runner, "LocalCluster", MagicMock(side_effect=RuntimeError("Nanny failed\nto start")))
+    with pytest.raises(FleetError, match=r"^its processes do not start: Nanny failed to start$"):
+        runner._started()
 
 
 def test_a_worker_does_not_repeat_what_is_said_of_an_edited_joint_file(fleet, caplog, monkeypatch):

@@ -29,7 +29,7 @@ from distributed.utils import LoopRunner
 
 from drivelink import __version__
 from drivelink.fleet.joints import Joints, carried_joint
-from drivelink.fleet.storage import FleetError, Source, Store, fetched
+from drivelink.fleet.storage import FleetError, Source, Store, fetched, one_line
 from drivelink.fleet.table import FleetTable
 from drivelink.fleet.task import Outcome, Task, broken_row, named_time, process, recorded_time
 
@@ -260,6 +260,7 @@ def _started(**how: Any) -> LocalCluster:
 
     Raises:
         KeyboardInterrupt: before all have started; they end with this process.
+        FleetError: they do not start.
     """
     loop = LoopRunner()
     resource_tracker.ensure_running()  # else the first process lifts the mask to start it
@@ -273,6 +274,8 @@ def _started(**how: Any) -> LocalCluster:
     except KeyboardInterrupt:
         atexit.unregister(close_clusters)  # it refuses those that have not started, with a traceback
         raise
+    except RuntimeError as error:  # one was killed meanwhile, for want of memory say
+        raise FleetError(f"its processes do not start: {one_line(error)}") from error
 
 
 def _remote(address: str, insecure: bool) -> Client:
@@ -299,8 +302,7 @@ def _remote(address: str, insecure: bool) -> Client:
         get_address_host_port(address)  # before there is a client, which would have to be closed
         return Client(address, security=security, timeout=f"{_CONNECT_S:g}s", set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
-        line = " ".join(str(error).split())
-        raise FleetError(f"--scheduler {address}: cannot be reached: {line}") from error
+        raise FleetError(f"--scheduler {address}: cannot be reached: {one_line(error)}") from error
 
 
 def _check_workers(client: Client, address: str) -> None:
@@ -308,10 +310,8 @@ def _check_workers(client: Client, address: str) -> None:
     try:
         versions = client.run(_worker_version)
     except Exception as error:  # whatever a worker of another version raises
-        line = " ".join(str(error).split())
-        raise FleetError(
-            f"--scheduler {address}: its workers need drivelink {__version__}: {line}"
-        ) from error
+        why = f"its workers need drivelink {__version__}: {one_line(error)}"
+        raise FleetError(f"--scheduler {address}: {why}") from error
     for worker, version in versions.items():
         if version != __version__:
             raise FleetError(

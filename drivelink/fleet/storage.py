@@ -116,7 +116,7 @@ def _opened(url: str) -> tuple[Any, str]:
         try:
             fs, path = url_to_fs(url)
         except ImportError as error:
-            raise FleetError(f"{url}: {_line(error)}") from error
+            raise FleetError(f"{url}: {one_line(error)}") from error
     return fs, str(path)
 
 
@@ -128,7 +128,7 @@ def _checked(what: str) -> Iterator[None]:
     except FleetError:
         raise
     except Exception as error:  # each storage of fsspec has its own
-        raise FleetError(f"{what}: {_line(error)}") from error
+        raise FleetError(f"{what}: {one_line(error)}") from error
 
 
 def _url(pattern: str, fs: Any, path: str) -> str:
@@ -142,7 +142,8 @@ def _url(pattern: str, fs: Any, path: str) -> str:
     return next(url for url in addresses if fs._strip_protocol(url) == path)
 
 
-def _line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
+    """Return what an error says, in one line."""
     text = getattr(error, "strerror", None) or error  # without the name, which `what` has
     return " ".join(str(text).split()) or type(error).__name__
 

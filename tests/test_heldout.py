@@ -16,6 +16,7 @@ from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
+from estimator.diagnosis.twins import twins
 from estimator.errors import EstimatorError
 from estimator.harm import Unseen, _Figure, harm, harm_of_parts
 from estimator.identify import _fitted, identify
@@ -161,6 +162,15 @@ def test_an_effect_on_a_reading_is_as_improbable_as_it_is_far_off(name, said, mo
         x[mine] = found.regression.mean[mine] + off * found.regression.std[mine]
         prior.append(replace(found, posterior=found.posterior._replace(x=x)).log_prior(50.0, 1.0))
     assert prior[0] - prior[1] == pytest.approx(12.5 if said else 0.0)
+
+
+@pytest.mark.parametrize(("amplitude", "open_"), [(1.0, True), (20.0, False)])
+def test_a_scale_and_a_part_of_a_ripple_are_told_apart_by_a_whole_turn(amplitude, open_, model):
+    search = Search(Problem([record(SOFT, amplitude)], model, BANDWIDTH_HZ))
+    found = search.with_effect(search.null, "encoder_scale", None)
+    assert found is not None
+    alike = [(twin.instead, twin.measured) for twin in twins(found, search.problem)]
+    assert alike == [(frozenset({("kinematic_error", 0)}), False)] * open_
 
 
 def test_a_file_that_explains_less_than_the_declared_one_is_not_written(healthy):

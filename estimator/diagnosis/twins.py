@@ -36,6 +36,7 @@ _TABLE = (
     (("back_driving_loss",), ("load_dependent_friction",), "link", True),
     (("motor_inertia",), ("torque_constant",), "link", False),  # one scale
     (("encoder_eccentricity",), ("kinematic_error",), "reaction", False),  # once a turn
+    (("encoder_scale",), ("kinematic_error",), "turn", False),  # over a part of its period: a slope
     (("asymmetric_friction",), ("coulomb_friction", "torque_offset"), "", True),  # the sum
     (("backlash",), ("higher_order_stiffness",), "law", False),  # what bends otherwise looks like play
 )
@@ -46,17 +47,18 @@ def twins(fitted: Fitted, problem: Problem) -> Iterator[Twin]:
     """Yield what a hypothesis holds and what may be instead."""
     own = fitted.keys | _constants(fitted, problem)
     linked = problem.frames[0].linked and not problem.calibrating
+    turned = max(float(np.ptp(frame.motors[0].link_position)) for frame in problem.frames) >= 2.0 * np.pi
     for one, other, told, both in _TABLE:
         for i, motor in enumerate(problem.model.motors):
             spring = motor.transmission
             law = spring.model != "polynomial" or bool(spring.parameters)
-            if (told == "link" and linked) or (told == "law" and law):
+            if (told == "link" and linked) or (told == "law" and law) or (told == "turn" and turned):
                 continue
             for here, there in ((one, other), (other, one))[: 1 + both]:
                 held, instead = ({_key(name, i) for name in names} for names in (here, there))
                 if held <= own:
                     again = {(name + AGAIN * ((name, i) in own - held), i) for name, i in instead}
-                    yield Twin(frozenset(held), frozenset(again), told == "reaction" and linked)
+                    yield Twin(frozenset(held), frozenset(again), told in ("reaction", "turn") and linked)
 
 
 def _key(name: str, motor: int) -> tuple[str, int | None]:

@@ -230,6 +230,7 @@ IDENTITY = {
     "without tokens the first writer is taken until it is stale, then a token decides": (
         ("", True, True), ("b2", False, False), ("b2", True, True), "+c3", ("b2", False, False), ("c3", False, True),
     ),
+    "a token that names no session counts for nothing": ("+", "+no session", "+" + 33 * "f", ("", True, True)),
     "more tokens than are remembered lock nobody out": (
         *(f"+{number:x}" for number in range(MAX_CLAIMS + 10)), "+abcdef0123456789", ("abcdef0123456789", True, True),
         ("abcdef0123456789", False, True), ("1", False, True), ("abcdef0123456789", False, False),

@@ -235,9 +235,11 @@ def test_connections_that_say_nothing_lock_no_subscriber_out(three):
     host, port = endpoint.removeprefix("tcp/").split(":")
     with ExitStack() as stack:
         for _ in range(min(idle, mine - 200)):
-            stack.enter_context(socket.create_connection((host, int(port))))
+            last = stack.enter_context(socket.create_connection((host, int(port))))
         with open_client(endpoint) as session:
             hear(session, {"a", "b", "c"})
+        last.settimeout(6.0)
+        assert last.recv(1) == b""  # after two seconds; zenoh's own ten would keep their files
 
 
 @pytest.mark.parametrize("command", [["run", "elbow.toml", "--interface", "socketcand"], ["monitor"]])

@@ -8,6 +8,8 @@ import math
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 import tracemalloc
@@ -73,6 +75,15 @@ class Scene:
     def finish(self) -> list[tuple[Path, str]]:
         self.box.close()
         return [(path, event_of(path).cause) for path in kept(self.path.parent / "kept", "elbow")]
+
+
+def test_that_a_joint_file_was_edited_is_the_daemons_to_say(tmp_path):
+    path = tmp_path / "elbow.toml"
+    text = (Path(__file__).parent.parent / "examples" / "elbow.toml").read_text(encoding="utf-8")
+    path.write_text(text.replace('folder = "kept"', 'folder = "here"'))
+    command = [sys.executable, "-m", "drivelink.cli.blackbox", str(path)]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and "edited" not in done.stderr
 
 
 def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(tmp_path, caplog):

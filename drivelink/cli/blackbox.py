@@ -88,6 +88,7 @@ def main() -> int:
     args = parser.parse_args()
     log_to_stderr(logging.INFO)
     logging.getLogger("can").setLevel(logging.CRITICAL)  # some interfaces log every partial read
+    logging.getLogger("drivelink.jointfile").setLevel(logging.ERROR)  # the daemon has said that it was edited
     os.nice(_NICE)
     ended = threading.Event()
     threading.Thread(target=_wait, args=(ended,), daemon=True).start()

@@ -247,7 +247,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    logging.getLogger("drivelink.recording").setLevel(
-        logging.ERROR
-    )  # the daemon said what was missing as it was
+    logging.getLogger("drivelink.recording").setLevel(logging.ERROR)  # the daemon has said what was missing
     sys.exit(main())

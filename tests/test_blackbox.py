@@ -161,7 +161,7 @@ def test_a_state_that_is_read_before_the_first_model_is_of_it_and_not_of_the_nex
     assert states == {b"first", None}
 
 
-def test_memory_holds_no_more_than_is_kept_and_ten_alarms_a_minute_make_one_recording(tmp_path):
+def test_memory_holds_no_more_than_is_kept_and_ten_alarms_a_minute_make_one_recording(tmp_path, monkeypatch):
     scene = Scene(tmp_path)
     scene.run(2000)
     reach_s = 10.0 + 12.0 + 2 * AFTER_S  # before, a state before that, after, and until it is written
@@ -171,6 +171,13 @@ def test_memory_holds_no_more_than_is_kept_and_ten_alarms_a_minute_make_one_reco
         scene.run(24, Status.MODEL_ALARM)
         scene.run(24)
     assert len(scene.finish()) == 1
+    monkeypatch.setattr(
+        blackbox, "_BLOCK_ITEMS", 10
+    )  # of a bus that is flooded: ten seconds in eleven blocks
+    ring = blackbox.Ring(10.0)
+    for number in range(500):
+        ring.take((0.0, "frame", (number,)))
+    assert len(list(ring.between(-math.inf, math.inf))) <= 12 * 10
 
 
 def test_a_cycle_takes_no_more_memory_than_its_messages_take_on_the_wire(tmp_path):
@@ -258,6 +265,13 @@ def test_keep_says_what_became_of_it(is_full, tmp_path, monkeypatch, capsys):
 
 
 def test_the_oldest_is_dropped_beyond_the_budget_and_nothing_else(tmp_path):
+    (tmp_path / "own").mkdir()
+    scene = Scene(tmp_path / "own", "keep_mib = 0.001\n")
+    for _ in range(2):
+        scene.box.keep("asked", asked=True)
+        scene.run(130)
+    assert len(scene.finish()) == 1
+    shutil.rmtree(tmp_path / "own")
     names = [f"elbow-2026010{day}T000000Z-model-alarm.mcap" for day in (1, 2, 3)]
     others = ["elbow-2-20250101T000000Z-change.mcap", "elbow-best.mcap", "notes.txt"]
     for name in (*names, *others):

@@ -15,7 +15,7 @@ import zenohkit
 from drivelink import cli
 from drivelink import files as written
 from drivelink.errors import RecordingError, UsageError
-from drivelink.files import NewFile, check_target, write_whole
+from drivelink.files import NewFile, check_target, read_regular, write_whole
 from drivelink.jointfile import parse
 from drivelink.recording.formats import open_sink
 from estimator.sample import Sample
@@ -238,3 +238,10 @@ def test_fit_brings_its_own_joint_file_up_to_date_in_one_step(files, monkeypatch
         assert cli.main([*arguments, "--force", "--out", str(out), *more]) == 0
         assert "# my own remark" in joint.read_text()
     assert sorted(path.name for path in out.iterdir()) == ["fit.json", "fit.png"]
+
+
+def test_a_file_beyond_its_limit_is_not_read(tmp_path):
+    (path := tmp_path / "a").write_bytes(bytes(2049))
+    assert read_regular(path, 2049) == bytes(2049)
+    with pytest.raises(OSError, match="expected at most 2 KiB, got more"):
+        read_regular(path, 2048)

@@ -10,7 +10,10 @@ import joints
 import numpy as np
 import pytest
 
+from drivelink import jointfile
+from drivelink.jointfile.apply_diagnosis import diagnosed_model
 from estimator.batch import fit, fit_joint
+from estimator.diagnosis import diagnose
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.problem import Problem
@@ -239,6 +242,20 @@ def test_what_valid_estimates_leave_is_compared_over_the_same_samples(healthy, m
     for more, said in ((0.0, "None"), (1.0, "valid estimates leave")):
         monkeypatch.setattr("estimator.harm._replayed", replayed(more))
         assert said in str(harm(model, written, [Unseen.whole(healthy)]))
+
+
+def test_a_constant_torque_of_a_rigid_joint_is_written_beside_what_is_found():
+    """The file's balance leaves what the diagnosis says that it leaves."""
+    joint = jointfile.parse(
+        f'name = "axis"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\nviscous_damping_nm_s_rad = {kit.DAMPING}\n'
+        'transmission = { model = "none" }\n'
+    )
+    theta, _, own = motion()
+    torque = own + 0.8 * np.sign(np.gradient(theta)) + 0.5
+    found = diagnose(joints.recorded(theta, torque, None), joint.model(), BANDWIDTH_HZ)
+    assert [effect.name for effect in found.effects] == ["coulomb_friction"]
+    (offset,) = (e for e in diagnosed_model(joint, found).motors[0].effects if e.name == "torque_offset")
+    assert offset.parameters["torque_nm"] == pytest.approx(0.5, abs=0.02)
 
 
 def test_a_file_is_not_written_while_its_balance_leaves_more_than_the_spring_carries(healthy):

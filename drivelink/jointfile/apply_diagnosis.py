@@ -147,6 +147,7 @@ def _readings(outcome: Diagnosis, motor: int | None) -> list[Effect]:
     else:
         places = {
             f"motor{motor + 1}_torque_delay_s": ("torque_delay", "delay_s"),
+            f"motor{motor + 1}_torque_offset_nm": ("torque_offset", "torque_nm"),
             f"motor{motor + 1}_deflection_offset_rad": ("deflection_offset", "offset_rad"),
         }
     return [

@@ -34,7 +34,11 @@ __all__ = [
 ]
 
 DELAYS = ("encoder_delay", "torque_delay")
-_CHANNELS = {"torque_delay": "torque_delay_s", "deflection_offset": "deflection_offset_rad"}
+_CHANNELS = {
+    "torque_delay": "torque_delay_s",
+    "deflection_offset": "deflection_offset_rad",
+    "torque_offset": "torque_offset_nm",
+}
 
 
 def findings_of(
@@ -160,7 +164,11 @@ def stamped_wrongly(name: str, delay_s: float, period_s: float) -> str | None:
 def alignment_of(
     problem: Problem, after: Fitted, effects: list[Finding], surplus: float
 ) -> dict[str, tuple[float, float]]:
-    """Return everyday corrections of the readings with their standard deviations, by channel."""
+    """Return everyday corrections of the readings with their standard deviations, by channel.
+
+    A constant torque of a flexible joint may as well be a zero of its encoders: it is none.
+    """
+    flexible = problem.frames[0].flexible
     named = {(f.name, f.motor) for f in effects}
     pairs: dict[str, tuple[float, float]] = {}
     std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, after, surplus)), 0.0))
@@ -176,7 +184,7 @@ def alignment_of(
             continue
         if slot.name == "encoder_delay":
             pairs["link_position_delay_s"] = value, float(sigma)
-        elif slot.name in _CHANNELS:
+        elif slot.name in _CHANNELS and (slot.name != "torque_offset" or not flexible[slot.motor or 0]):
             pairs[f"motor{(slot.motor or 0) + 1}_{_CHANNELS[slot.name]}"] = value, float(sigma)
     return pairs
 

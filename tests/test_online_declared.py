@@ -137,6 +137,27 @@ def test_an_unknown_spring_may_have_a_corner_and_be_bent_to_one_side(pull):
     assert not any(estimator.undeclared())
 
 
+def test_a_steep_spring_is_as_stiff_as_it_is_at_every_deflection():
+    """From 4.5 to 90 N·m/rad: the deflection was filtered as of one stiffness, with a damping a period late; the stiffness was
+    three times as far off as its interval said."""
+
+    def stiffness(phi):
+        return 4.5 * np.exp(6.6 * np.abs(phi))
+
+    plants = joints.Plants(
+        lambda phi: np.sign(phi) * (stiffness(phi) - 4.5) / 6.6, stiffness, 0.1, 1.2, 0.43, 0.3, 2.5
+    )
+    truth = joints.simulate(plants, joints.sweep(np.random.default_rng(3), 12000, 1, 1, T, 10.0, 3.0), T)
+    noise = np.random.default_rng(5).normal(0.0, 0.02, (12000, 1))
+    record = joints.record(truth, 0, T, motor_counts=8192, link_bits=17, torque_noise=noise)
+    out = joints.estimates(joints.joint_model(0.1, 1.2, model="exponential", parameters={}), record)[-6000:]
+    true = truth.sigma[-6000:, 0, 0]
+    off = np.abs(out[:, 3] - true)
+    assert np.max(true) > 10.0 * np.min(true)
+    assert np.mean(off < 2.0 * out[:, 4]) > 0.9
+    assert np.sqrt(np.mean((off / true) ** 2)) < 1e-3
+
+
 def test_of_a_joint_that_a_hand_guides_the_interval_holds_what_noise_takes_off_the_scale():
     """The drive only damps: its torque follows from the motion, and all columns are the smaller the better they fit. It was
     a quarter too soft, and valid."""

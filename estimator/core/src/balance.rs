@@ -52,6 +52,19 @@ pub const TORQUE_SECOND: usize = 36;
 /// −q′: with θ′ the rate of the deflection, for a damping of the transmission.
 pub const LINK_RATE: usize = 37;
 
+/// Columns that are functions of u, those of their slopes, and by what these are multiplied.
+#[must_use]
+pub fn slopes(family: &Family) -> [(usize, usize, f64); 2 * TERMS + 1] {
+    let (powers, mut out) = (family.powers(), [(CORNER, UNEVEN, 2.0); 2 * TERMS + 1]);
+    for k in 0..TERMS {
+        out[k] = (SPRING.start + k, SLOPE.start + k, 1.0);
+        let less = powers.iter().position(|power| *power == powers[k] - 2.0);
+        let factor = if less.is_some() { powers[k] * (powers[k] - 1.0) } else { 0.0 };
+        out[TERMS + k] = (SLOPE.start + k, SPRING.start + less.unwrap_or(0), factor);
+    }
+    out
+}
+
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
 const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len() + 2; // columns that are functions of the raw φ

@@ -1,9 +1,9 @@
 //! The present deflection, without the delay of the regression's filter.
 //!
-//! A steady-state Kalman filter with the states [θ, θ′, φ, φ′, φ″]: the motor moves by its own equation (eq
-//! 5, with the stiffness that has been estimated), the deflection by a random third derivative, and θ and
-//! q = θ + φ are measured. With coarse encoders it relies on the torque balance, with fine ones on the
-//! encoders. Its covariance is iterated at the update rate, not at every tick.
+//! An extended Kalman filter with the states [θ, θ′, φ, φ′, φ″]: the motor moves by its own equation (eq 5, with
+//! the spring's curve that has been estimated, and its slope where it is), the deflection by a random third
+//! derivative, and θ and q = θ + φ are measured. With coarse encoders it relies on the torque balance, with fine
+//! ones on the encoders.
 //!
 //! That covariance assumes white noise and a white third derivative. Fine encoders violate it. So the
 //! innovations of φ are compared with it: where their mean square e² is more than the S = P + R it foresees,
@@ -33,10 +33,11 @@ pub struct DeflectionFilter {
     gains: [State; 2], // by θ and by φ
     x: State,
     p: Option<Covariance>,
+    tuned: bool,    // whether noise and motion are known
     modelled: bool, // whether the motor's equation is of use
-    pull: f64,      // what half a period of φ′ adds to the motor's mean acceleration
+    drift: f64,     // spectral density of what it leaves, rad²/s³
+    motor_noise: f64,
     motion: Motion,
-    counted: f64,
     foreseen: f64,
     noise: f64,  // R, the variance of φ's noise that p assumes, rad²
     wander: f64, // spectral density of φ‴, rad²/s⁵
@@ -47,14 +48,13 @@ pub struct DeflectionFilter {
 /// How the joint moves, and how well that is foreseen.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Motion {
-    jerk: f64,         // mean square of φ‴ …
-    peak: f64,         // … and its largest value of late
-    squares: [f64; 2], // mean squares of the velocities of motor and link
-    missed: f64,       // mean square of φ's innovation, over what is foreseen
+    jerk: f64,   // mean square of φ‴ …
+    peak: f64,   // … and its largest value of late
+    missed: f64, // mean square of φ's innovation, over what is foreseen
 }
 
 /// Nothing has been seen.
-pub const AT_REST: Motion = Motion { jerk: 0.0, peak: 0.0, squares: [0.0; 2], missed: 1.0 };
+pub const AT_REST: Motion = Motion { jerk: 0.0, peak: 0.0, missed: 1.0 };
 
 /// What is known of the deflection since the moment of the torque.
 #[derive(Clone, Copy, Debug)]
@@ -82,8 +82,6 @@ pub struct Tuning {
     pub damping: f64,
     /// The transmission's likewise.
     pub rate_damping: f64,
-    /// σ; 0 where it is not known yet.
-    pub stiffness: f64,
     /// rms of what the motor's equation leaves unexplained; ∞: it is not used at all.
     pub unmodelled: f64,
 }
@@ -111,10 +109,11 @@ impl DeflectionFilter {
             gains: plain,
             x: [0.0; STATES],
             p: None,
+            tuned: false,
             modelled: false,
-            pull: 0.0,
+            drift: 0.0,
+            motor_noise: 0.0,
             motion: AT_REST,
-            counted: 0.0,
             foreseen: f64::INFINITY,
             noise: 0.0,
             wander: 0.0,
@@ -124,8 +123,8 @@ impl DeflectionFilter {
 
     /// Forget everything.
     pub fn reset(&mut self) {
-        (self.motion, self.p, self.noise, self.modelled) = (AT_REST, None, 0.0, false);
-        (self.gains, self.pull, self.counted, self.foreseen) = (self.plain, 0.0, 0.0, f64::INFINITY);
+        (self.motion, self.p, self.noise, self.tuned) = (AT_REST, None, 0.0, false);
+        (self.gains, self.foreseen) = (self.plain, f64::INFINITY);
         self.restart(0.0, 0.0);
     }
 
@@ -175,33 +174,35 @@ impl DeflectionFilter {
         self.x[1] + self.x[3]
     }
 
-    /// Variance of φ: the filter's, as its own innovations bear it out, or that of as many counts as pass
-    /// while it averages.
-    ///
-    /// A quantised position errs alike until the next count, so in a memory 1/w there are 1 + rate/(w count)
-    /// independent errors that average out.
+    /// Variance of φ, as the filter's own innovations bear it out, rad².
     #[must_use]
     pub fn variance(&self) -> f64 {
-        self.p.map_or(0.0, |p| (p[2][2] * self.motion.missed.max(1.0)).max(self.counted))
+        self.p.map_or(0.0, |p| p[2][2] * self.motion.missed.max(1.0))
     }
 
-    /// One period later: measured θ and φ, and the torque that acted, τ + τ_e − x, N·m.
-    pub fn update(&mut self, theta: f64, phi: f64, torque: f64) {
+    /// One period later: measured θ and φ, the torque that acted, τ + τ_e − x, N·m, and the stiffness where it did; 0: it is
+    /// not known.
+    pub fn update(&mut self, theta: f64, phi: f64, torque: f64, stiffness: f64) {
         let t = self.period;
         let [x0, x1, x2, x3, x4] = self.x;
-        let plain = self.unsettled > 0;
-        let modelled = self.modelled && !plain;
-        let a = if modelled {
-            (torque - self.damping * x1) / self.inertia + self.pull * x3 // eq 5
+        let (plain, c) = (self.unsettled > 0, stiffness.max(0.0) / self.inertia);
+        let modelled = self.tuned && self.modelled && 0.0 < c && c * t * t < STIFF;
+        let a = if modelled && !plain {
+            // Eq 5, with φ and θ′ of the middle of the period.
+            let half = 0.5 * t;
+            (torque - self.damping * x1 + half * stiffness * x3) / (self.inertia + half * self.damping)
         } else {
             0.0
         };
         let ahead = [x0 + t * (x1 + 0.5 * t * a), x1 + t * a, x2 + t * (x3 + 0.5 * t * x4), x3 + t * x4, x4];
         let (e, f) = (theta - ahead[0], phi - ahead[2]);
         if !(f.abs() < FAR * (1.0 + phi.abs()) && e.is_finite()) {
-            self.modelled = false; // a stiffness that cannot be has made the motion model unstable
+            self.tuned = false; // a stiffness that cannot be has made the motion model unstable
             self.restart(theta, phi);
             return;
+        }
+        if self.tuned && !plain {
+            self.correct(self.moved(if modelled { c } else { 0.0 }));
         }
         let [g, h] = if plain { &self.plain } else { &self.gains };
         for i in 0..STATES {
@@ -227,55 +228,39 @@ impl DeflectionFilter {
 
     /// How large the motion is.
     fn watch(&mut self, jerk: f64) {
-        let rates = [self.x[1], self.x[1] + self.x[3]];
         let motion = &mut self.motion;
         motion.jerk += self.average * (HIDDEN * jerk * jerk - motion.jerk);
         motion.peak = (self.fade * motion.peak).max(motion.jerk);
-        for (square, rate) in motion.squares.iter_mut().zip(rates) {
-            *square += self.average * (rate * rate - *square);
-        }
     }
 
-    /// One step towards the steady-state gains.
+    /// What the covariance grows by, and noise.
     pub fn tune(&mut self, tuning: &Tuning) {
         let (t, w) = (self.period, self.w);
         (self.inertia, self.damping) = (tuning.inertia, tuning.damping);
         self.watch(tuning.jerk);
         let noise = tuning.motor_noise + tuning.link_noise;
-        if !(noise > 0.0 && self.motion.peak > 0.0 && tuning.unmodelled < f64::INFINITY) {
-            self.modelled = false; // the motor's balance is unknown: it cannot predict its motion
-            return;
+        self.tuned = noise > 0.0 && self.motion.peak > 0.0 && tuning.unmodelled < f64::INFINITY;
+        if !self.tuned {
+            return; // the motor's balance is unknown: it cannot predict its motion
         }
         let density = noise * t;
         let natural = (self.motion.jerk.max(0.1 * self.motion.peak) * AHEAD_S / density).powf(1.0 / 6.0);
         let natural = natural.clamp(SLOWEST * w, FAR * w);
-        self.count_steps(tuning, natural);
-        let mut c = tuning.stiffness.max(0.0) / self.inertia;
-        let mut drift = (tuning.unmodelled / self.inertia).powi(2) * AHEAD_S;
         // Where the link is held, D and the transmission's damping may be large and cancel each other.
         let damped = (tuning.damping.abs() + tuning.rate_damping.abs()) * t / self.inertia;
-        if !(damped < DAMPED && c * t * t < STIFF && drift < noise * w.powi(4) * 1e6) {
-            (self.damping, c, drift) = (0.0, 0.0, noise * w.powi(4));
-        }
-        self.modelled = c > 0.0;
-        self.pull = 0.5 * c * t;
-        let mut start = [[0.0; STATES]; STATES];
-        for (i, power) in [0, 2, 0, 2, 4].into_iter().enumerate() {
-            start[i][i] = noise * w.powi(power);
-        }
-        let mut before = self.p.unwrap_or(start);
+        self.drift = (tuning.unmodelled / self.inertia).powi(2) * AHEAD_S;
+        self.modelled = damped < DAMPED && self.drift < noise * w.powi(4) * 1e6;
         // Noise is measured late: the state has errors of its size by now.
         let grown = if noise > self.noise && self.noise > 0.0 { noise / self.noise } else { 1.0 };
-        before.iter_mut().flatten().for_each(|entry| *entry *= grown);
-        (self.noise, self.wander) = (noise, density * natural.powi(6));
-        let moved = self.moved(&before, c, drift * t, self.wander * t);
-        self.correct(moved, tuning.motor_noise);
+        self.p.iter_mut().flatten().flatten().for_each(|entry| *entry *= grown);
+        (self.noise, self.motor_noise) = (noise, tuning.motor_noise);
+        self.wander = density * natural.powi(6);
     }
 
     /// Kalman gains for measured θ and φ = q − θ, whose noises share θ's, from P before the readings.
-    fn correct(&mut self, moved: Covariance, motor_noise: f64) {
+    fn correct(&mut self, moved: Covariance) {
         let (s00, s01, s11) =
-            (moved[0][0] + motor_noise, moved[0][2] - motor_noise, moved[2][2] + self.noise);
+            (moved[0][0] + self.motor_noise, moved[0][2] - self.motor_noise, moved[2][2] + self.noise);
         let determinant = s00 * s11 - s01 * s01;
         if !(determinant > 0.0 && determinant < f64::INFINITY) {
             self.p = None;
@@ -286,51 +271,45 @@ impl DeflectionFilter {
             let (theta, phi) = (moved[i][0], moved[i][2]);
             self.gains[0][i] = (s11 * theta - s01 * phi) / determinant;
             self.gains[1][i] = (s00 * phi - s01 * theta) / determinant;
-            for j in 0..STATES {
-                after[i][j] -= self.gains[0][i] * moved[0][j] + self.gains[1][i] * moved[2][j];
+            for j in 0..=i {
+                let left = moved[i][j] - self.gains[0][i] * moved[0][j] - self.gains[1][i] * moved[2][j];
+                (after[i][j], after[j][i]) = (left, left);
             }
         }
         self.foreseen = s11;
-        self.p = Some(after);
+        self.p = (0..STATES).all(|i| after[i][i] > 0.0).then_some(after); // rounding has left some of each
     }
 
-    /// F P F' + Q over one period; `c`: σ/B, `drift`: what θ′ gains, `jerk`: what φ″ gains.
-    fn moved(&self, p: &Covariance, c: f64, drift: f64, jerk: f64) -> Covariance {
-        let t = self.period;
+    /// F P F' + Q over one period; `c`: σ/B, 0: the motor's equation is not used.
+    fn moved(&self, c: f64) -> Covariance {
+        let (t, quick) = (self.period, self.noise * self.w.powi(4));
+        let p = self.p.unwrap_or_else(|| {
+            let mut start = [[0.0; STATES]; STATES];
+            for (i, power) in [0, 2, 0, 2, 4].into_iter().enumerate() {
+                start[i][i] = self.noise * self.w.powi(power);
+            }
+            start
+        });
+        let (damping, drift) = if c > 0.0 { (self.damping, self.drift) } else { (0.0, quick) };
         let pull = c * t;
-        let mut f = [[0.0; STATES]; STATES];
-        for i in 0..STATES {
-            f[i][i] = 1.0;
+        let step = |x: &State| {
+            [
+                x[0] + t * (x[1] + 0.5 * pull * x[2]),
+                x[1] - t * damping / self.inertia * x[1] + pull * x[2],
+                x[2] + t * (x[3] + 0.5 * t * x[4]),
+                x[3] + t * x[4],
+                x[4],
+            ]
+        };
+        let half = p.map(|row| step(&row)); // P F'
+        let mut out = [[0.0; STATES]; STATES];
+        for j in 0..STATES {
+            let column = step(&std::array::from_fn(|k| half[k][j]));
+            (j..STATES).for_each(|i| (out[i][j], out[j][i]) = (column[i], column[i]));
         }
-        (f[0][1], f[0][2]) = (t, 0.5 * t * pull);
-        (f[1][1], f[1][2]) = (1.0 - t * self.damping / self.inertia, pull);
-        (f[2][3], f[2][4], f[3][4]) = (t, 0.5 * t * t, t);
-        let (mut half, mut out) = ([[0.0; STATES]; STATES], [[0.0; STATES]; STATES]);
-        for i in 0..STATES {
-            for j in 0..STATES {
-                half[i][j] = (0..STATES).map(|k| f[i][k] * p[k][j]).sum();
-            }
-        }
-        for i in 0..STATES {
-            for j in 0..=i {
-                let sum: f64 = (0..STATES).map(|k| half[i][k] * f[j][k]).sum();
-                (out[i][j], out[j][i]) = (sum, sum);
-            }
-        }
-        out[1][1] += drift;
-        out[4][4] += jerk;
+        out[1][1] += drift * t;
+        out[4][4] += self.wander * t;
         out
-    }
-
-    /// The variance of φ that quantisation leaves, were all noise quantisation.
-    fn count_steps(&mut self, tuning: &Tuning, memory_rad_s: f64) {
-        self.counted = 0.0;
-        for (i, noise) in [tuning.motor_noise, tuning.link_noise].into_iter().enumerate() {
-            if noise > 0.0 {
-                let counts = (self.motion.squares[i] / (12.0 * noise)).sqrt() / memory_rad_s;
-                self.counted += noise / (1.0 + counts);
-            }
-        }
     }
 }
 
@@ -344,10 +323,49 @@ mod tests {
         filter.restart(0.0, 0.0);
         for k in 1..3000 {
             let t = f64::from(k) * 1e-3;
-            filter.update(0.2 * t, 0.1 * t + 0.3 * t * t, 0.0);
+            filter.update(0.2 * t, 0.1 * t + 0.3 * t * t, 0.0, 0.0);
         }
         assert!((filter.at(0.0) - (0.1 * 2.999 + 0.3 * 2.999 * 2.999)).abs() < 1e-6);
         assert!((filter.link_rate() - (0.2 + 0.1 + 0.6 * 2.999)).abs() < 1e-4);
+    }
+
+    #[test]
+    fn a_steep_spring_behind_a_coarse_encoder_is_followed_better_than_it_is_read() {
+        let (t, inertia, damping, count) = (1e-3, 0.1, 1.2, 7.7e-4);
+        let spring = |phi: f64| {
+            let stiffness = 4.5 * (6.6 * phi.abs()).exp();
+            ((stiffness - 4.5) / 6.6 * phi.signum(), stiffness)
+        };
+        let (theta, phi) = (|s: f64| 0.8 * (7.0 * s).sin(), |s: f64| 0.45 * (12.0 * s).sin());
+        let mut filter = DeflectionFilter::new(inertia, damping, 60.0, t, 0.03);
+        let tuning = Tuning {
+            jerk: 0.45 * 12.0_f64.powi(3),
+            motor_noise: count * count / 12.0,
+            link_noise: 1e-10,
+            inertia,
+            damping,
+            rate_damping: 0.0,
+            unmodelled: 0.01,
+        };
+        filter.restart(0.0, 0.0);
+        let mut square = 0.0;
+        for k in 1..6000 {
+            let (now, before) = (f64::from(k) * t, (f64::from(k) - 0.5) * t);
+            let acceleration = -49.0 * theta(before);
+            let torque =
+                inertia * acceleration + damping * 5.6 * (7.0 * before).cos() - spring(phi(before)).0;
+            let read = (theta(now) / count).round() * count;
+            let (acting, stiffness) = spring(filter.at(0.0));
+            filter.update(read, theta(now) + phi(now) - read, torque + acting, stiffness);
+            if k % 30 == 0 {
+                filter.tune(&tuning);
+            }
+            if k > 3000 {
+                square += (filter.at(0.0) - phi(now)).powi(2) / 2999.0;
+            }
+        }
+        assert!(square < tuning.motor_noise / 9.0, "{} of {}", square.sqrt(), tuning.motor_noise.sqrt());
+        assert!((0.5..2.0).contains(&(square / filter.variance())), "{square} of {}", filter.variance());
     }
 
     #[test]
@@ -361,7 +379,6 @@ mod tests {
             inertia: 0.0275,
             damping: -damping,
             rate_damping: damping,
-            stiffness,
             unmodelled: 0.1,
         };
         filter.restart(0.0, 0.0);
@@ -369,7 +386,7 @@ mod tests {
         for k in 1..5000 {
             let theta = 0.008 * (f64::from(k) * 2e-3).sin() + 1e-5 * (f64::from(k) * 2.3).sin();
             let acting = stiffness * filter.at(0.0) + damping * filter.rate();
-            filter.update(theta, -theta, stiffness * theta + acting);
+            filter.update(theta, -theta, stiffness * theta + acting, stiffness);
             if k % 10 == 0 {
                 filter.tune(&tuning);
             }

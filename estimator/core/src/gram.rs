@@ -105,14 +105,14 @@ impl Gram {
         }
     }
 
-    /// The noise in functions of a signal that has this variance of it, from the columns of their slopes.
+    /// The noise in functions of a signal that has this variance of it: each with the column of its slope, and by what that
+    /// is multiplied.
     #[must_use]
-    pub fn noise(&self, of: Range<usize>, slopes: usize, variance: f64) -> Gram {
+    pub fn noise(&self, functions: &[(usize, usize, f64)], variance: f64) -> Gram {
         let mut out = Gram { rows: self.rows, ..Gram::default() };
-        let first = of.start;
-        for i in of.clone() {
-            for j in of.clone() {
-                out.sums[i][j] = variance * self.at(slopes + i - first, slopes + j - first);
+        for (i, slope, factor) in functions {
+            for (j, other, more) in functions {
+                out.sums[*i][*j] = variance * factor * more * self.at(*slope, *other);
             }
         }
         out

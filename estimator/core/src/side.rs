@@ -243,11 +243,8 @@ impl Side {
         if !self.rigid {
             let late_s = self.blocks.torque_lateness().0;
             let late = last.torque[i] + late_s * self.balance.light_torque()[1];
-            self.deflection.update(
-                theta,
-                phi,
-                late + self.acting - self.declared.formed + self.declared.elastic,
-            );
+            let torque = late + self.acting - self.declared.formed + self.declared.elastic;
+            self.deflection.update(theta, phi, torque, self.stiffness);
             self.balance.observe(phi, usable && can_be);
         }
     }
@@ -299,7 +296,6 @@ impl Side {
             inertia: if inertia > 0.0 { inertia } else { self.inertia },
             damping,
             rate_damping,
-            stiffness: self.stiffness,
             unmodelled: if self.fits { self.blocks.unmodelled() } else { f64::INFINITY },
         });
     }

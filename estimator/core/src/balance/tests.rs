@@ -86,6 +86,27 @@ fn columns_that_have_grown_are_those_of_a_joint_that_was_larger_from_the_start()
     }
 }
 
+/// What noise in u adds to a column is its slope, which is another column.
+#[test]
+fn the_slopes_of_columns_are_columns() {
+    let columns = |family: &Family, u: f64| {
+        let mut row = [0.0; COLUMNS];
+        row[SPRING.start..SLOPE.end].copy_from_slice(&family.at(u, 0.1));
+        (row[UNEVEN], row[CORNER]) = (u.abs(), u * u.abs());
+        row
+    };
+    for family in [Family::Smooth, Family::Kinked] {
+        for u in [-0.7, 0.3] {
+            let (now, h) = (columns(&family, u), 1e-6);
+            for (column, slope, factor) in slopes(&family).into_iter().filter(|(_, _, factor)| *factor > 0.0)
+            {
+                let ahead = columns(&family, u + h)[column] - columns(&family, u - h)[column];
+                assert!((ahead / (2.0 * h) - factor * now[slope]).abs() < 1e-7, "{column} at {u}");
+            }
+        }
+    }
+}
+
 /// A gap's edge inside a piece: its slope is the mean of 0 and K over it, its variance known in closed form.
 #[test]
 fn a_piece_with_an_edge_is_as_uncertain_as_the_edge_makes_it() {

@@ -149,6 +149,7 @@ mod tests {
     use crate::gram::{COLUMNS, Posterior, UNKNOWNS, dot};
     use crate::model::{Motor, Transmission};
     use crate::settings::Priors;
+    use crate::unknowns::ASYMMETRY;
 
     fn declared() -> Blocks {
         let transmission = Transmission::Elastic {
@@ -159,6 +160,18 @@ mod tests {
         };
         let motor = Motor::bare(5e-4, 5e-3, transmission);
         Blocks::new(&motor, &Priors::USUAL, 1e-3, 100.0, 75, 1.0)
+    }
+
+    #[test]
+    fn one_side_does_not_tell_a_spring_that_is_stiffer_to_the_other_from_another_curve() {
+        let mut blocks = declared();
+        let asked = |blocks: &mut Blocks, seen: [f64; 2]| {
+            blocks.seen = seen;
+            let frame = blocks.spring.frame(&Projection::new(&blocks.family, 0.5, f64::INFINITY));
+            blocks.groups(&frame).1.contains(&set(ASYMMETRY))
+        };
+        assert!(asked(&mut blocks, [-0.1, 0.5]));
+        assert!(!asked(&mut blocks, [0.1, 0.5]) && !asked(&mut blocks, [-0.5, -0.1]));
     }
 
     #[test]

@@ -74,7 +74,7 @@ impl Blocks {
         let Some(known) = self.posterior.as_ref().filter(|_| !self.lost) else { return 0.0 };
         let bending = set(STOPS) | set(CLIPS) | set(CORNER) | set(ASYMMETRY);
         let straight = self.spring.is_constant() && !self.moved;
-        let both_sides = !self.spring.is_searched() || self.seen[0] < 0.0 && 0.0 < self.seen[1];
+        let both_sides = !self.spring.is_searched() || self.is_on_both_sides();
         let bends = known.set & bending != 0 || self.spring.is_longer(known.set);
         let before = self.before.as_ref().is_some_and(|before| before.set >> ZERO & 1 == 1);
         let told = both_sides && !bends && (before || self.ring.len() > FEWEST);

@@ -10,7 +10,8 @@ use crate::gram::{
 };
 use crate::laws::{Law, PARAMETERS};
 use crate::unknowns::{
-    ACTIVE, CANDIDATES, CLIPS, DRY, ECCENTRIC, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO,
+    ACTIVE, ASYMMETRY, CANDIDATES, CLIPS, DRY, ECCENTRIC, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring,
+    ZERO,
 };
 
 const WIDE: f64 = 1e6; // of a prior that says nothing
@@ -121,7 +122,7 @@ impl Blocks {
     /// What the positions' noise adds to the products of the spring's columns.
     fn noise_of_columns(&self, total: &Gram) -> Gram {
         let of_u = self.readings.deflection / self.deflection.powi(2);
-        total.noise(balance::SPRING, balance::SLOPE.start, of_u)
+        total.noise(&balance::slopes(&self.family), of_u)
     }
 
     /// The unknowns from all blocks.
@@ -252,7 +253,16 @@ impl Blocks {
             // What depends on where the zero is says nothing while no motion tells.
             groups.iter_mut().filter(|group| **group & !anywhere() != 0).for_each(|group| *group = 0);
         }
+        if !self.is_on_both_sides() {
+            // A spring that is stiffer to the other side is another curve.
+            groups.iter_mut().filter(|group| **group == set(ASYMMETRY)).for_each(|group| *group = 0);
+        }
         (base, groups)
+    }
+
+    /// Whether the transmission has been bent to both sides.
+    pub(super) fn is_on_both_sides(&self) -> bool {
+        self.seen[0] < 0.0 && 0.0 < self.seen[1]
     }
 
     /// The unknowns that evidence chooses, and whether the zero is anywhere.

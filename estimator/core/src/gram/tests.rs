@@ -124,7 +124,7 @@ fn a_column_that_leaves_less_of_the_noise_of_another_one_is_no_evidence() {
     let (gram, frame) = (sum(&read), plain(0b110));
     let left = gram.quadratic(&frame.residual(&[gain; UNKNOWNS], 0b10)) / gram.rows;
     let of_column = left / gain.powi(2); // its variance
-    let noisy = frame.reduce_noisy(&gram, &gram.noise(1..2, 3, of_column));
+    let noisy = frame.reduce_noisy(&gram, &gram.noise(&[(1, 3, 1.0)], of_column));
     let odds = |reduced: &Reduced| {
         log_evidence(reduced, 0b110, &prior, left) - log_evidence(reduced, 0b10, &prior, left)
     };

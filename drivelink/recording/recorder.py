@@ -37,6 +37,7 @@ _SNAPSHOTS = 2  # that wait: each has some megabytes
 _FLUSH_S = 1.0
 _POLL_S = 0.005
 _AT_ONCE = 1000  # messages of a key, or frames, until the file has its turn
+_REST_S = 5.0  # for what still waits at the end
 _REOPEN_S = 0.5
 _ANSWER_S = 1.0  # of a daemon
 _STALE_S = 1.0  # after which another session may take over without a liveliness token
@@ -109,11 +110,12 @@ class ZenohTap:
         silence_s = now_s - self._heard_s
         return silence_s if _STALE_S < silence_s < math.inf else 0.0
 
-    def poll(self, most: int = _AT_ONCE) -> None:
-        """Store what has come, at most so many of a key."""
-        now_s = time.monotonic()
+    def poll(self) -> bool:
+        """Store what has come, but not all at once; return whether there is more."""
+        now_s, more = time.monotonic(), False
         for subscriber, take in self._streams:
-            for sample in waiting(subscriber, most):
+            for number, sample in enumerate(waiting(subscriber, _AT_ONCE), 1):
+                more = more or number == _AT_ONCE
                 if not self._identity.accepts(source_of(sample), now_s - self._heard_s > _STALE_S):
                     continue
                 self._silent_s += self._silence(now_s)
@@ -122,6 +124,7 @@ class ZenohTap:
                     take(sample)
                 except ZenohError:
                     self._impossible += 1
+        return more
 
     def finish(self) -> None:
         """Do nothing."""
@@ -202,8 +205,9 @@ class BusTap:
         """Why no samples can be made."""
         return self._samples.missing if self._samples is not None else ""
 
-    def poll(self, most: int = _AT_ONCE) -> None:
-        """Store the frames that have come, at most so many."""
+    def poll(self) -> bool:
+        """Store the frames that have come, but not all at once; return whether there are more."""
+        most = _AT_ONCE
         if isinstance(self._source, LostSource):
             self._reopen()
         try:
@@ -216,6 +220,7 @@ class BusTap:
         except BusLostError as error:
             _LOG.error("%s: the bus is lost: %s: no frames until it is back", self._section.channel, error)
             self._source = LostSource()
+        return most <= 0
 
     def _reopen(self) -> None:
         now_s = time.monotonic()
@@ -283,8 +288,10 @@ class Recorder:
                 self.sink.flush()
                 tick()
             time.sleep(_POLL_S)
+        end_s = time.monotonic() + _REST_S
+        while sum(tap.poll() for tap in self.taps) and time.monotonic() < end_s:
+            pass
         for tap in self.taps:
-            tap.poll(MAX_UNREAD)
             tap.finish()
 
 

@@ -54,3 +54,16 @@ def test_a_gap_that_a_straight_line_bridges_badly_is_no_change(name, gap):
     estimates, _ = kit.play(kit.declared(name), left)
     assert not np.any(estimates.status & int(Status.CHANGED))
     assert np.mean(estimates.valid[SETTLED:]) > 0.95
+
+
+def test_what_is_left_out_after_a_long_gap_is_not_as_it_was_before():
+    """The estimate before the gap was valid for another eight samples: it is held for 20 ms of time, not of samples."""
+    motion = kit.motion("quadratic", 8.0)
+    elsewhere = [
+        sample._replace(motor_position_rad=(sample.motor_position_rad[0] + 1000.0,), sequence=sample.sequence)
+        for sample in motion.samples[6000:6005]
+    ]
+    estimates, _ = kit.play(kit.declared("quadratic"), [*motion.samples[:4500], *elsewhere])
+    assert np.all(estimates.valid[4000:4500])
+    assert not np.any(estimates.status[4500:] & int(Status.VALID | Status.TORQUE_VALID))
+    assert np.all(estimates.status[4500:] & int(Status.INPUT_REJECTED))

@@ -101,6 +101,7 @@ pub struct Blocks {
     /// The functions that the spring's curve is a sum of.
     pub family: Family,
     located: bool, // the zero, so well that the balance can be linearised
+    placed: bool,  // two blocks say where it is
     /// How far a lost zero is from where deflections are counted from, rad; 0: near.
     pub off: f64,
     /// Whether evidence chose a zero that is not the declared one.
@@ -165,6 +166,7 @@ impl Blocks {
             seen: [0.0; 2],
             family: Family::of(Some(&spring.law)),
             located: true,
+            placed: true,
             off: 0.0,
             moved: false,
             posterior: None,
@@ -194,7 +196,8 @@ impl Blocks {
         self.waiting.clear();
         self.take_open();
         (self.posterior, self.frame) = (self.spring.declared_posterior(), None);
-        (self.oldest, self.moved, self.located, self.skipped, self.fitted) = (0, false, true, 0, false);
+        (self.oldest, self.skipped, self.fitted) = (0, 0, false);
+        (self.moved, self.located, self.placed) = (false, true, true);
         self.end_doubt();
         self.unform();
         (self.noise.variance, self.own, self.torque, self.quick) = (f64::NAN, f64::NAN, f64::NAN, 0.0);
@@ -241,7 +244,7 @@ impl Blocks {
     #[must_use]
     pub fn is_unconfirmed(&self) -> bool {
         let nothing_before = self.before.is_none() && !self.spring.is_anchored();
-        !self.lost && !self.located
+        !self.placed
             || self.ring.len() < FEWEST && (nothing_before || self.lost && !self.spring.is_constant())
     }
 
@@ -334,4 +337,17 @@ impl Blocks {
     pub fn is_suspected(&self) -> bool {
         self.suspected
     }
+}
+
+/// A VSA-II of the unit tests.
+#[cfg(test)]
+fn declared() -> Blocks {
+    let transmission = crate::model::Transmission::Elastic {
+        law: crate::laws::Law::VsaII,
+        order: None,
+        parameters: vec![0.5, 1.75],
+        covariance: None,
+    };
+    let motor = Motor::bare(5e-4, 5e-3, transmission);
+    Blocks::new(&motor, &Priors::USUAL, 1e-3, 100.0, 75, 1.0)
 }

@@ -70,7 +70,6 @@ struct Live {
     tick: u64,
     unsettled: i64, // periods for which the filters still hold something wrong
     said: i64,
-    rejected: i64,
     sequence: u64,                     // of the last sample that was used
     refused: Option<(Suspicion, i64)>, // what was wrong with a sample of late, and for how long that is said
     why: Option<Why>,
@@ -96,7 +95,6 @@ impl Live {
             tick: 0,
             unsettled: 0,
             said: 0,
-            rejected: 0,
             sequence: 0,
             refused: None,
             why: None,
@@ -174,8 +172,8 @@ impl Robust {
         self.corrections.reset();
         self.momentum.iter_mut().for_each(LinkMomentum::lose_zero);
         (self.live.begins, self.live.zeros_known, self.live.jumped) = (true, false, None);
-        (self.live.rejected, self.live.refused, self.live.external, self.live.why, self.live.estimate) =
-            (0, None, None, None, None);
+        (self.live.refused, self.live.external) = (None, None);
+        (self.live.why, self.live.estimate) = (None, None);
     }
 
     /// The next sample may not be of its moment: learn nothing until the filters have forgotten it.
@@ -256,7 +254,6 @@ impl Robust {
         let Some(corrected) = self.corrections.correct(sample, accepted.restart) else {
             return self.hold(sample.sequence, accepted.status);
         };
-        self.live.rejected = 0;
         self.live.measured = corrected.present.external_torque;
         let (at, present) = (self.positions(&corrected.aligned), self.positions(&corrected.present));
         if let Some(jumps) = self.live.jumped.take() {

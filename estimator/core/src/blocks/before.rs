@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::Blocks;
 use super::solve::{Rows, rarity};
-use crate::choices::{ACCUSED, DRIFTED, REACHED, USEFUL};
-use crate::gram::{Gram, Prior, Set, UNKNOWNS, Vector, inverse, set, solve};
+use crate::choices::{ACCUSED, DRIFTED, REACHED, SURE, USEFUL};
+use crate::gram::{Gram, Posterior, Prior, Set, UNKNOWNS, Vector, inverse, set, solve};
 use crate::spring::{Projection, TERMS};
 use crate::unknowns::{
     ACTIVE, CLIPS, DRY, ECCENTRIC, INERTIA, LOAD, OFFSET, RATE, SOFT, SPRING, Spring, ZERO,
@@ -96,13 +96,26 @@ impl Blocks {
         self.located = true;
     }
 
-    /// Evidence has said where the zero is: it is known when two blocks say so, and the balance is linearised near it: a
-    /// step of the iteration stays within a part of the motion.
-    pub(super) fn place_zero(&mut self, moved: bool, step: f64) {
-        if !self.lost {
-            let near = f64::from(ZEROS) * step <= self.seen[1] - self.seen[0];
-            self.located = near && moved == self.moved;
-        }
+    /// Evidence has said where the zero is: it is known when two blocks say so. One that is not lost is then so near that a
+    /// step of the iteration stays within a part of the motion. With one that was lost the spring is as it was a block
+    /// before, `from`: its curve may have several zeros that explain few rows, each with another shape.
+    pub(super) fn place_zero(&mut self, moved: bool, step: f64, from: &Spring, chosen: &Posterior) {
+        let near = |step: f64| f64::from(ZEROS) * step.abs() <= self.seen[1] - self.seen[0];
+        let agree = |unknown: usize, now: f64, then: f64| {
+            let before = self.posterior.as_ref().map_or(0.0, |before| before.covariance[unknown][unknown]);
+            (now - then).powi(2) <= SURE * SURE * (chosen.covariance[unknown][unknown] + before)
+        };
+        self.placed = if self.lost {
+            let (zero, then) = (self.spring.zero, from.zero);
+            let alike = |(i, now): (usize, &f64)| {
+                let then = from.alpha[i];
+                (now - then).abs() <= DRIFTED * now.abs() || agree(SPRING.start + i, *now, then)
+            };
+            self.spring.parameters().iter().enumerate().all(alike)
+                && (near(zero - then) || agree(ZERO, zero, then) || self.spring.is_constant())
+        } else {
+            near(step) && moved == self.moved
+        };
         self.moved = moved;
     }
 
@@ -189,4 +202,29 @@ impl Blocks {
 /// Unknowns that are the same wherever the zero is.
 pub(super) fn anywhere() -> Set {
     set(1..SPRING.start + 1) | set(ZERO..LOAD.start) | set(RATE..CLIPS.start) | set(ECCENTRIC)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::declared;
+    use super::*;
+
+    #[test]
+    fn a_lost_zero_is_known_when_two_blocks_have_the_same_spring() {
+        let mut blocks = declared();
+        (blocks.lost, blocks.seen) = (true, [-0.1, 0.5]);
+        let unknowns = set(SPRING.start..SPRING.start + 2) | set(ZERO..ZERO + 1);
+        let mut covariance = [[0.0; UNKNOWNS]; UNKNOWNS];
+        (0..UNKNOWNS).for_each(|i| covariance[i][i] = 1e-8);
+        let known = Posterior::believed(unknowns, [0.0; UNKNOWNS], covariance);
+        blocks.posterior = Some(known.clone());
+        let from = blocks.spring.clone();
+        for (factor, off, placed) in
+            [(1.0, 0.0, true), (1.5, 0.0, false), (1.01, 0.0, true), (1.0, 0.2, false)]
+        {
+            (blocks.spring.alpha[0], blocks.spring.zero) = (factor * from.alpha[0], off);
+            blocks.place_zero(false, 0.0, &from, &known);
+            assert_eq!(blocks.placed, placed, "{factor} {off}");
+        }
+    }
 }

@@ -144,23 +144,11 @@ impl Blocks {
 
 #[cfg(test)]
 mod tests {
+    use super::super::declared;
     use super::*;
     use crate::balance;
     use crate::gram::{COLUMNS, Posterior, UNKNOWNS, dot};
-    use crate::model::{Motor, Transmission};
-    use crate::settings::Priors;
     use crate::unknowns::ASYMMETRY;
-
-    fn declared() -> Blocks {
-        let transmission = Transmission::Elastic {
-            law: Law::VsaII,
-            order: None,
-            parameters: vec![0.5, 1.75],
-            covariance: None,
-        };
-        let motor = Motor::bare(5e-4, 5e-3, transmission);
-        Blocks::new(&motor, &Priors::USUAL, 1e-3, 100.0, 75, 1.0)
-    }
 
     #[test]
     fn one_side_does_not_tell_a_spring_that_is_stiffer_to_the_other_from_another_curve() {

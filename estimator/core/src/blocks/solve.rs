@@ -139,7 +139,7 @@ impl Blocks {
         }
         self.fit_projection();
         let Some(projection) = self.projection.clone() else { return };
-        let zero = if self.lost { self.deflection } else { self.near() };
+        let (from, zero) = (self.spring.clone(), if self.lost { self.deflection } else { self.near() });
         let of_columns = self.noise_of_columns(&total);
         for step in 0..STEPS {
             let frame = self.spring.frame(&projection);
@@ -163,7 +163,6 @@ impl Blocks {
             if step + 1 < STEPS && is_far(&chosen) && !self.spring.is_settled() {
                 continue;
             }
-            self.place_zero(moved, before[ZERO].abs());
             self.friction = frame.rms(&total, &chosen, shaped());
             let omitted = self.omitted(&rows, &chosen, &used);
             let attenuated = self.attenuated(&chosen, total.rows, noise);
@@ -172,6 +171,7 @@ impl Blocks {
             let entries = chosen.covariance.iter_mut().flatten().zip(more);
             entries.for_each(|(v, (omitted, attenuated))| *v += omitted + attenuated);
             self.torque = self.spring.torque_rms(&projection, &total, self.lost);
+            self.place_zero(moved, before[ZERO], &from, &chosen);
             (self.posterior, self.frame) = (Some(chosen), Some(frame));
             break;
         }

@@ -53,9 +53,8 @@ impl Robust {
 
     /// What is said where the sample cannot be used: the last estimate, for a while.
     pub(super) fn hold(&mut self, sequence: u64, flags: u32) -> Estimate {
-        self.live.rejected += 1;
         self.live.external = self.momentum.as_ref().map(|momentum| momentum.latest.repeat(sequence));
-        let since = self.live.rejected as f64 * self.period;
+        let since = sequence.wrapping_sub(self.live.sequence) as f64 * self.period;
         let rejected = Some(Why::new(Reason::Rejected, None));
         let Some(last) = self.live.estimate else {
             self.live.why = rejected;

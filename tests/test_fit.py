@@ -116,7 +116,7 @@ def test_what_cannot_be_fitted_is_reported(elbow):
         (still, (model,), "stands still"),
         (joints.part(record, slice(100)), (model,), "at least"),
         (joints.part(record, slice(1500)), (model, 2.0 * np.pi * 4.0), short),
-        (record, (joints.joint_model(1.0, 1.0, m=2),), "2 motor"),
+        (record, (joints.joint_model(1.0, 1.0, m=2),), "1 motor: expected 2"),
     ):
         with pytest.raises(EstimatorError, match=message):
             fit(wrong, *how)

@@ -3,67 +3,17 @@
 //! F τ = B F θ″ + D F θ′ + offset + friction − F f(φ) − …: every column passes the same filters, so their lag
 //! cancels. The spring is a curve over [`crate::spring`]'s functions of u = φ over the deflection's size.
 
+mod columns;
+
 use serde::{Deserialize, Serialize};
+
+pub use columns::*;
 
 use crate::choices::{FAR, GROWN, SLOW};
 use crate::effects::Declared;
 use crate::gram::{COLUMNS, Gram, Row};
 use crate::signals::{Channel, Filters, Formed, Lanes};
 use crate::spring::{Family, TERMS};
-
-/// F τ, N·m.
-pub const TORQUE: usize = 0;
-/// Its rate, N·m/s: a torque that is read late.
-pub const TORQUE_RATE: usize = 1;
-/// F θ″: the inertia, kg·m².
-pub const ACCELERATION: usize = 2;
-/// F θ′: the damping, N·m·s/rad.
-pub const VELOCITY: usize = 3;
-/// 1: a constant torque, N·m.
-pub const OFFSET: usize = 4;
-/// Sign of θ′: dry friction, N·m.
-pub const DRY: usize = 5;
-/// A softer sign of θ′: friction that grows with speed before it is full, N·m.
-pub const SOFT: usize = 6;
-/// |b₁| and |b₂| times the sign of θ′: friction of the load, N·m.
-pub const LOAD: [usize; 2] = [7, 23];
-/// −|u|: a spring that is stiffer to one side, N·m.
-pub const UNEVEN: usize = 8;
-/// −bₖ: the spring, N·m.
-pub const SPRING: std::ops::Range<usize> = 9..9 + TERMS;
-/// −bₖ′: a spring whose zero is elsewhere, N·m.
-pub const SLOPE: std::ops::Range<usize> = 14..14 + TERMS;
-/// −bₖ′ q′, the first ones: a link position that is read late.
-pub const LATE: std::ops::Range<usize> = 19..21;
-/// −bₖ′ q, the first ones: a link position of another scale.
-pub const READ: std::ops::Range<usize> = 21..23;
-/// −(stops of three widths on u): memory of the transmission, N·m.
-pub const STOPS: std::ops::Range<usize> = 24..27;
-/// −(u clipped at four widths): a spring of any shape, N·m.
-pub const CLIPS: std::ops::Range<usize> = 27..31;
-/// −u |u|: a spring whose stiffness has a corner at zero, N·m.
-pub const CORNER: usize = 31;
-/// −bₖ′ sin q, the first ones: a link encoder that is eccentric.
-pub const SINE: std::ops::Range<usize> = 32..34;
-/// −bₖ′ cos q, likewise.
-pub const COSINE: std::ops::Range<usize> = 34..36;
-/// The torque's second derivative, N·m/s²: one that is read late by much.
-pub const TORQUE_SECOND: usize = 36;
-/// −q′: with θ′ the rate of the deflection, for a damping of the transmission.
-pub const LINK_RATE: usize = 37;
-
-/// Columns that are functions of u, those of their slopes, and by what these are multiplied.
-#[must_use]
-pub fn slopes(family: &Family) -> [(usize, usize, f64); 2 * TERMS + 1] {
-    let (powers, mut out) = (family.powers(), [(CORNER, UNEVEN, 2.0); 2 * TERMS + 1]);
-    for k in 0..TERMS {
-        out[k] = (SPRING.start + k, SLOPE.start + k, 1.0);
-        let less = powers.iter().position(|power| *power == powers[k] - 2.0);
-        let factor = if less.is_some() { powers[k] * (powers[k] - 1.0) } else { 0.0 };
-        out[TERMS + k] = (SLOPE.start + k, SPRING.start + less.unwrap_or(0), factor);
-    }
-    out
-}
 
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise

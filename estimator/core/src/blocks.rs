@@ -240,7 +240,8 @@ impl Blocks {
         self.lost
     }
 
-    /// Whether fewer blocks than an interval needs are all that tells of the spring, or of a lost zero.
+    /// Whether two blocks have not yet said where the zero is, or fewer than an interval needs are all that tells of the
+    /// spring or of a lost zero.
     #[must_use]
     pub fn is_unconfirmed(&self) -> bool {
         let nothing_before = self.before.is_none() && !self.spring.is_anchored();

@@ -277,7 +277,7 @@ impl DeflectionFilter {
             }
         }
         self.foreseen = s11;
-        self.p = (0..STATES).all(|i| after[i][i] > 0.0).then_some(after); // rounding has left some of each
+        self.p = (0..STATES).all(|i| after[i][i] > 0.0).then_some(after); // else rounding has eaten it: it begins anew
     }
 
     /// F P F' + Q over one period; `c`: σ/B, 0: the motor's equation is not used.

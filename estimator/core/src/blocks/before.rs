@@ -96,23 +96,25 @@ impl Blocks {
         self.located = true;
     }
 
-    /// Evidence has said where the zero is: it is known when two blocks say so. One that is not lost is then so near that a
-    /// step of the iteration stays within a part of the motion. With one that was lost the spring is as it was a block
-    /// before, `from`: its curve may have several zeros that explain few rows, each with another shape.
+    /// Evidence has said where the zero is: it is known when two blocks say so.
+    ///
+    /// One that is not lost is then so near that the last `step` of the iteration stays within a part of the motion. With one
+    /// that was lost the spring is as it was a block before, `from`: few rows are explained by several zeros, each with a
+    /// curve of its own.
     pub(super) fn place_zero(&mut self, moved: bool, step: f64, from: &Spring, chosen: &Posterior) {
         let near = |step: f64| f64::from(ZEROS) * step.abs() <= self.seen[1] - self.seen[0];
-        let agree = |unknown: usize, now: f64, then: f64| {
+        let agree = |unknown: usize, step: f64| {
             let before = self.posterior.as_ref().map_or(0.0, |before| before.covariance[unknown][unknown]);
-            (now - then).powi(2) <= SURE * SURE * (chosen.covariance[unknown][unknown] + before)
+            step * step <= SURE * SURE * (chosen.covariance[unknown][unknown] + before)
         };
         self.placed = if self.lost {
-            let (zero, then) = (self.spring.zero, from.zero);
+            let off = self.spring.zero - from.zero;
             let alike = |(i, now): (usize, &f64)| {
-                let then = from.alpha[i];
-                (now - then).abs() <= DRIFTED * now.abs() || agree(SPRING.start + i, *now, then)
+                let change = now - from.alpha[i];
+                change.abs() <= DRIFTED * now.abs() || agree(SPRING.start + i, change)
             };
             self.spring.parameters().iter().enumerate().all(alike)
-                && (near(zero - then) || agree(ZERO, zero, then) || self.spring.is_constant())
+                && (near(off) || agree(ZERO, off) || self.spring.is_constant())
         } else {
             near(step) && moved == self.moved
         };

@@ -122,7 +122,7 @@ impl Blocks {
     /// What the positions' noise adds to the products of the spring's columns.
     fn noise_of_columns(&self, total: &Gram) -> Gram {
         let of_u = self.readings.deflection / self.deflection.powi(2);
-        total.noise(&balance::slopes(&self.family), of_u)
+        total.noise(&balance::slopes(), of_u)
     }
 
     /// The unknowns from all blocks.

@@ -297,6 +297,7 @@ def test_keep_without_a_black_box_says_what_it_expects(tmp_path, capsys):
     assert "no black box writes there: expected a daemon that was started since" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path, capsys):
     bus = f'interface = "socketcand"\noptions = {{ host = "127.0.0.1", port = {zenohkit.free_port()} }}\nperiod_s = 0.005'
     path = tmp_path / "elbow.toml"

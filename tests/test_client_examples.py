@@ -47,6 +47,7 @@ def test_the_python_examples_run(daemon, name, expected, more):
         assert any(re.search(expected, line) for line in process.stdout)
 
 
+@pytest.mark.slow
 def test_python_examples_end_without_a_traceback_by_ctrl_c_and_where_nobody_reads_on(daemon):
     buffered = {
         "PYTHONUNBUFFERED": ""

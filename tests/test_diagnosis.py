@@ -325,6 +325,7 @@ def test_rounding_of_a_healthy_joint_as_it_is_packaged_is_no_effect():
     assert (found.verdict, found.effects) == ("sufficient", ())
 
 
+@pytest.mark.slow
 def test_a_spring_that_is_no_polynomial_is_no_play_where_the_order_is_open():
     """Beside an effect the order is chosen with the effect, and play is as likely as another law at most."""
     lone, beside = kit.World([{"bend_nm_rad2": 1500.0}, {"bend_nm_rad2": 1500.0, "cogging_nm": 0.6}]).run()

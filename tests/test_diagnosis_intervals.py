@@ -108,6 +108,7 @@ def test_an_effect_is_no_delay_of_a_reading_and_in_the_interval_of_the_damping(l
     assert std is not None and abs(motor.viscous_damping_nm_s_rad - kit.DAMPING) < SIGMA_95 * std
 
 
+@pytest.mark.slow
 def test_no_shape_is_stated_that_the_law_does_not_have():
     """A constant spring declared as a VSA-II's: no joint file holds the shape that fits it."""
     (record,) = kit.World([{"hysteresis_nm": 0.6, "hysteresis_rad": 0.01}]).run()

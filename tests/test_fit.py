@@ -153,6 +153,7 @@ def test_no_delay_is_made_of_noise_and_one_that_is_there_has_an_honest_interval(
     assert np.sqrt(np.mean(np.square(z))) < 2.0
 
 
+@pytest.mark.slow
 def test_what_is_left_shows_friction_as_a_step_and_hysteresis_as_a_loop(tmp_path):
     effects = [{"coulomb_nm": 0.5}, {"hysteresis_nm": 1.0, "hysteresis_rad": 0.01}]
     (stuck,), (looping,) = (fit(record, kit.model()) for record in kit.World(effects, seconds=6.0).run())

@@ -58,6 +58,7 @@ def hear(session, expected):
     until(exactly)
 
 
+@pytest.mark.slow
 def test_when_the_first_daemon_is_killed_the_others_are_received_again(endpoint):
     with script("a", endpoint) as a:
         ready(a)

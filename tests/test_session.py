@@ -223,6 +223,27 @@ def test_a_daemon_says_that_its_router_is_lost_and_back(endpoint, router):
     assert [event["text"] for event in daemon.events.recent()][-1] == "the zenoh router is back"
 
 
+def test_of_two_daemons_that_a_router_joins_later_each_says_that_there_is_another(endpoint, router, tmp_path):
+    alone = '{ mode: "peer", scouting: { multicast: { enabled: false } }, '
+    wait = f'connect: {{ endpoints: ["{endpoint}"], timeout_ms: -1, exit_on_failure: false }} }}'
+    (tmp_path / "alone.json5").write_text(alone + wait)
+    joint = vsa().model_copy(update={"zenoh": ZenohSection(config="alone.json5")})
+    with ExitStack() as stack:
+        stack.enter_context(served(joint))
+        daemon = stack.enter_context(
+            Daemon([ServedJoint(joint=joint, path=tmp_path / "j.toml")], real_time=False)
+        )
+        session = stack.enter_context(closing(open_session(joint.zenoh, tmp_path)))
+        rival = JointPublisher(session, joint)  # neither sees the other
+        assert not daemon.events.active
+        with router():
+            (text,) = until(lambda: list(daemon.events.active.values()))
+            assert text.startswith("another daemon serves a joint named elbow, too")
+            rival.close()
+            until(lambda: not daemon.events.active)
+            assert daemon.events.recent()[-1]["text"] == "no other daemon serves a joint named elbow any more"
+
+
 def test_connections_that_say_nothing_lock_no_subscriber_out(three):
     """Each waits for its handshake; more than may wait at a time would make a subscriber wait, too."""
     endpoint, daemons = three

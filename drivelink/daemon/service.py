@@ -293,8 +293,17 @@ class Daemon:
         for served in self._joints:
             publisher = JointPublisher(session, served.joint, express=served is self._joints[-1])
             self._closing.callback(publisher.close)
+            publisher.watch_rivals(partial(self._note_rival, served.joint.name))
             publishers.append(publisher)
         return publishers
+
+    def _note_rival(self, name: str, there: bool) -> None:
+        text = (
+            f"another daemon serves a joint named {name}, too: a subscriber follows either; end or rename one"
+        )
+        self.events.keep(
+            f"{name} rival", there, text, f"no other daemon serves a joint named {name} any more"
+        )
 
     def _timed(self, joint: JointFile) -> JointFile:
         """Return a joint file with the measured period of SYNC."""

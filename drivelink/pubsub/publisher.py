@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -142,6 +142,23 @@ class JointPublisher:
                 if query is not None:
                     with query:
                         query.reply(f"{self.key}/{name}", self._documents[name], encoding=_JSON, express=True)
+
+    def watch_rivals(self, tell: Callable[[bool], object]) -> None:
+        """Call `tell` in zenoh's thread when another daemon serves this joint (True), or no more (False).
+
+        None does when this one starts, but a router that comes later may join two.
+        """
+        own, rivals = str(self._session.zid()), set[str]()
+
+        def changed(sample: zenoh.Sample) -> None:
+            there = sample.kind == zenoh.SampleKind.PUT
+            if (zid := str(sample.key_expr).rpartition("/")[2]) != own:
+                (rivals.add if there else rivals.discard)(zid)
+                tell(bool(rivals))
+
+        handler = zenoh.handlers.Callback(changed, indirect=False)  # as in `watch_router`
+        tokens = self._session.liveliness().declare_subscriber(f"{self.key}/alive/*", handler, history=True)
+        self._entities.append(tokens)
 
     def close(self) -> None:
         """Undeclare the keys, the liveliness token first; may be called twice."""

@@ -351,7 +351,7 @@ def two_joints() -> Iterator[Daemon]:
 class Broken:
     """An estimator with a mistake in it."""
 
-    residual_nm = 0.0
+    residual_nm = flexibility_torque_std_nm = 0.0
 
     def step(self, _sample: object) -> None:
         raise ZeroDivisionError("float division by zero")
@@ -396,6 +396,18 @@ def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_o
         made.run_lockstep(100)
         assert made.documents()[1]["state"] == "running"
         assert elbow.estimates == 400
+
+
+def test_the_status_says_how_well_the_torque_is_known():
+    with rig() as made:
+        assert math.isnan(made.status["flexibility_torque_std_nm"])
+        made.run(6000)
+        (world,) = made.network._worlds
+        for _ in range(20):
+            estimate, std = made.run(50)[-1], made.status["flexibility_torque_std_nm"]
+            assert estimate.status & Status.TORQUE_VALID
+            assert 0.0 < std < 0.02  # the joint's torques reach 0.1
+            assert abs(estimate.flexibility_torque_nm - world.truth().flexibility_torque_nm) < 4.0 * std
 
 
 class Full:

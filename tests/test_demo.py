@@ -3,6 +3,7 @@
 import io
 import itertools
 import json
+import logging
 import math
 import os
 import re
@@ -68,7 +69,16 @@ def test_what_is_not_valid_is_not_counted_and_an_interval_that_misses_the_truth_
     assert missed.errors().covered == 0.0
 
 
-SUMMARY = RunSummary(1200, 1150, 3, 180.0, 40.0, "")
+@pytest.fixture(autouse=True)
+def _logging_as_before():
+    """The demo silences its client's log for the rest of its process."""
+    log = logging.getLogger("drivelink.client")
+    level = log.level
+    yield
+    log.setLevel(level)
+
+
+SUMMARY = RunSummary(1200, 1150, 3, 180.0, 40.0, 0.0005, "")
 
 
 def test_a_live_view_is_drawn_by_the_thread_that_feeds_it(monkeypatch):
@@ -140,6 +150,7 @@ def test_an_end_before_the_first_valid_cycle_gives_no_error():
     comparison.received(message(1, 9.0, 900.0, status=Status(0)))
     said = closing(comparison)
     assert "of the last cycle, which is not valid" in said and "of the last cycle" not in nothing
+    assert "± 0.00098" in said  # the torque's
     for text in (nothing, said):
         assert "no valid cycle, so no error" in text and "1200 cycles, 3 missed" in text
         assert "relative to" not in text and "held the truth" not in text

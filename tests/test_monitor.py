@@ -93,6 +93,17 @@ def test_the_view_says_what_matters_at_80_by_24():
     assert sum(ord(c) > 0x2800 and ord(c) < 0x2900 for c in text) > 100  # the curves
 
 
+@pytest.mark.parametrize(
+    ("std_nm", "band"), [(0.0123, "± 0.024 N·m"), (None, ""), (-1.0, ""), (1e999, ""), ("x", "")]
+)
+def test_the_torque_has_the_interval_of_the_last_status(std_nm, band):
+    view = filled()
+    view.status = {**STATUS, "flexibility_torque_std_nm": std_nm}
+    (row,) = (line for line in lines(view) if "torque" in line and "over time" not in line)
+    assert band in row and ("±" in row) == bool(band)
+    assert (f"{band}," if band else "N·m,") in view.line().partition("torque")[2]
+
+
 def test_a_view_without_anything_yet_says_so():
     view = JointView("elbow")
     assert "waiting for the first estimate" in "\n".join(lines(view))

@@ -104,6 +104,7 @@ class JointStatus:
             "transmissions": loop_joint.pipeline.estimator.parameters(),
             "undeclared": loop_joint.pipeline.estimator.undeclared(),
             "friction": loop_joint.pipeline.estimator.friction(),
+            "flexibility_torque_std_nm": loop_joint.pipeline.estimator.flexibility_torque_std_nm,
             "residual_nm": loop_joint.pipeline.estimator.residual_nm,
             "residual_alarm": self._alarm(),
             "external": self._external(),

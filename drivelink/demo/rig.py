@@ -36,6 +36,7 @@ class RunSummary(NamedTuple):
     missed_cycles: int
     work_p99_us: float
     lateness_p99_us: float
+    torque_std_nm: float  # of the flexibility torque of the last cycle
     text: str
 
 
@@ -137,6 +138,7 @@ def _run(path: Path, seconds: float | None, connection: Connection, change: Chan
                 missed_cycles=loop_joint.pipeline.missed + loop.overruns,
                 work_p99_us=loop_joint.work.total().get("p99_us", 0.0),
                 lateness_p99_us=loop.lateness.total().get("p99_us", 0.0),
+                torque_std_nm=loop_joint.pipeline.estimator.flexibility_torque_std_nm,
                 text=daemon.summary(),
             )
     finally:

@@ -113,13 +113,14 @@ def closing(
     lines: list[str] = []
     if comparison.latest is not None:
         estimate, truth = comparison.latest
-        value, half = value_and_interval(estimate.stiffness_nm_rad, SIGMA_95 * estimate.stiffness_std_nm_rad)
-        torques = (number(one.flexibility_torque_nm) for one in (truth, estimate))
-        rows += [
-            ("stiffness / N·m/rad", number(truth.stiffness_nm_rad, 5), value, f"± {half}" if half else "",
-             _percent(errors.stiffness)),
-            ("flexibility torque / N·m", *torques, "", _percent(errors.flexibility_torque)),
-        ]  # fmt: skip
+        for name, true, found, std, error in (
+            ("stiffness / N·m/rad", number(truth.stiffness_nm_rad, 5), estimate.stiffness_nm_rad,
+             estimate.stiffness_std_nm_rad, errors.stiffness),
+            ("flexibility torque / N·m", number(truth.flexibility_torque_nm), estimate.flexibility_torque_nm,
+             summary.torque_std_nm, errors.flexibility_torque),
+        ):  # fmt: skip
+            value, half = value_and_interval(found, SIGMA_95 * std)
+            rows.append((name, true, value, f"± {half}" if half else "", _percent(error)))
         doubt = "" if estimate.status & Status.VALID else ", which is not valid"
         lines.append(f"truth, estimate and its 95 % interval: of the last cycle{doubt}")
     if errors.cycles:
@@ -134,7 +135,7 @@ def closing(
         f"a cycle's work p99 {summary.work_p99_us:.0f} µs, SYNC late by p99 {summary.lateness_p99_us:.0f} µs",
     ]
     if errors.cycles:
-        held = f"the 95 % interval held the truth in {_percent(errors.covered)}"
+        held = f"the stiffness's 95 % interval held the truth in {_percent(errors.covered)}"
         lines.append(f"{held} of {errors.cycles} valid cycles")
     grid = Grid(("", "truth", "estimate", "95 %", "rms error"), rows)
     return Section(f"{case}: truth beside estimate", [*([grid] if rows else []), *map(Paragraph, lines)])

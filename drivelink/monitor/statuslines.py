@@ -81,6 +81,7 @@ class Shown:
     rigid: bool = False  # whether the joint has no stiffness
     alarm: bool = False  # whether the model alarm is on
     location: str = ""  # likely location of the missing effect
+    torque_std_nm: float | None = None  # of the flexibility torque, N·m, or None
     residual_nm: float | None = None  # of the whole model, N·m, or None
     no_gauge: str = ""  # why `balances` is empty, where it is
     balances: tuple[ResidualGauge, ...] = ()  # residual and baseline per motor and of the link
@@ -128,6 +129,7 @@ def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> 
         rigid=_rigid(model or {}),
         alarm=alarm.get("active") is True,
         location=_text(alarm.get("location")),
+        torque_std_nm=_number(status.get("flexibility_torque_std_nm")),
         residual_nm=_number(status.get("residual_nm")) or None,  # 0: there was no motion to judge it by
         no_gauge=_SETTLING if alarm.get("watching") is True else _NO_BASELINE,
         balances=_balances(alarm, motors),

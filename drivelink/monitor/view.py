@@ -39,7 +39,7 @@ _TWO_ROWS = 20  # lines of the plots from which there are four
 SILENT_S = 1.0  # without an estimate, until the shown one is marked as old
 _HELP = (
     ("stiffness", "of the joint, N·m/rad, ± half its 95 % interval"),
-    ("torque", "flexibility torque of the joint, N·m"),
+    ("torque", "flexibility torque of the joint, N·m, ± half its 95 % interval by the last status"),
     ("external", "external torque on the link, N·m, ± half its 95 % interval"),
     ("deflection", "φ = q − θ of each transmission, rad; each: its stiffness, N·m/rad"),
     ("left plot", "stiffness over deflection, band dotted, ● now; cyan motor 1, magenta 2; grey dots: model"),
@@ -143,7 +143,7 @@ class JointView:
         parts = [
             f"{self.name}:",
             f"stiffness {with_interval(estimate.stiffness_nm_rad, half_interval(estimate), 'N·m/rad')},",
-            f"torque {self._torque(estimate.flexibility_torque_nm)} N·m,",
+            f"torque {''.join(self._torque_and_interval(estimate.flexibility_torque_nm))} N·m,",
             *self._external_words(),
             f"deflection {self.deflections(' ')}",
             "rad, " + ", ".join(text for text, _ in self.flags),
@@ -156,6 +156,11 @@ class JointView:
 
     def _torque(self, value_nm: float) -> str:
         return among(value_nm, self.history.largest_torque_nm)
+
+    def _torque_and_interval(self, value_nm: float) -> tuple[str, str]:
+        """The joint's torque, and half its 95 % interval by the newest status: empty where it has none."""
+        value, half = value_and_interval(value_nm, SIGMA_95 * (shape(self.status or {}).torque_std_nm or 0.0))
+        return (value, f" ± {half}") if half else (self._torque(value_nm), "")
 
     def deflections(self, between: str) -> str:
         """Return the deflection of each transmission now."""
@@ -228,11 +233,12 @@ class JointView:
         ink = ESTIMATE if self.live and last.valid else "dim"
         stiffness, half = value_and_interval(last.stiffness_nm_rad, half_interval(estimate))
         band = f" ± {half}" if half else ""
+        torque, torque_band = self._torque_and_interval(last.torque_nm)
         rows: list[tuple[RenderableType, ...]] = []
         for label, value, extra, unit, true, error, series in (
             ("stiffness", stiffness, band, "N·m/rad", last.true_stiffness_nm_rad, self.errors[0],
              [m.stiffness_nm_rad if m.valid else math.nan for m in window]),
-            ("torque", self._torque(last.torque_nm), "", "N·m", last.true_torque_nm, self.errors[1],
+            ("torque", torque, torque_band, "N·m", last.true_torque_nm, self.errors[1],
              [m.torque_nm if m.valid else math.nan for m in window]),
         ):  # fmt: skip
             truth = Text.assemble(

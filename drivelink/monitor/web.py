@@ -43,7 +43,8 @@ _EVENT_S = 0.1
 _LOCAL_HOSTS = frozenset({"localhost", "127.0.0.1", "[::1]"})
 _OWN_PAGES = ("same-origin", "none")  # what a browser says of our page, and of the user's own request
 _AS_SHOWN = (
-    "nodes", "wrong", "events", "not_valid", "rigid", "alarm", "advice", "residual_nm", "no_gauge", "improved"
+    "nodes", "wrong", "events", "not_valid", "rigid", "alarm", "advice", "torque_std_nm", "residual_nm",
+    "no_gauge", "improved",
 )  # fmt: skip
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; "

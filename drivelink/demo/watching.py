@@ -114,13 +114,13 @@ def closing(
     if comparison.latest is not None:
         estimate, truth = comparison.latest
         for name, true, found, std, error in (
-            ("stiffness / N·m/rad", number(truth.stiffness_nm_rad, 5), estimate.stiffness_nm_rad,
+            ("stiffness / N·m/rad", truth.stiffness_nm_rad, estimate.stiffness_nm_rad,
              estimate.stiffness_std_nm_rad, errors.stiffness),
-            ("flexibility torque / N·m", number(truth.flexibility_torque_nm), estimate.flexibility_torque_nm,
+            ("flexibility torque / N·m", truth.flexibility_torque_nm, estimate.flexibility_torque_nm,
              summary.torque_std_nm, errors.flexibility_torque),
         ):  # fmt: skip
             value, half = value_and_interval(found, SIGMA_95 * std)
-            rows.append((name, true, value, f"± {half}" if half else "", _percent(error)))
+            rows.append((name, number(true, 5), value, f"± {half}" if half else "", _percent(error)))
         doubt = "" if estimate.status & Status.VALID else ", which is not valid"
         lines.append(f"truth, estimate and its 95 % interval: of the last cycle{doubt}")
     if errors.cycles:

@@ -239,6 +239,7 @@ def test_of_two_daemons_that_a_router_joins_later_each_says_that_there_is_anothe
         with router():
             (text,) = until(lambda: list(daemon.events.active.values()))
             assert text.startswith("another daemon serves a joint named elbow, too")
+            assert not daemon.events.of("wrist").active  # that of another joint on the bus
             rival.close()
             until(lambda: not daemon.events.active)
             assert daemon.events.recent()[-1]["text"] == "no other daemon serves a joint named elbow any more"

@@ -298,12 +298,9 @@ class Daemon:
         return publishers
 
     def _note_rival(self, name: str, there: bool) -> None:
-        text = (
-            f"another daemon serves a joint named {name}, too: a subscriber follows either; end or rename one"
-        )
-        self.events.keep(
-            f"{name} rival", there, text, f"no other daemon serves a joint named {name} any more"
-        )
+        text = f"another daemon serves a joint named {name}, too: end or rename one"
+        over = f"no other daemon serves a joint named {name} any more"
+        self.events.of(name).keep(f"{name} rival", there, text, over)
 
     def _timed(self, joint: JointFile) -> JointFile:
         """Return a joint file with the measured period of SYNC."""

@@ -158,7 +158,7 @@ class JointView:
         return among(value_nm, self.history.largest_torque_nm)
 
     def _torque_and_interval(self, value_nm: float) -> tuple[str, str]:
-        """The joint's torque, and half its 95 % interval by the newest status: empty where it has none."""
+        """Return a torque, and half its 95 % interval by the newest status; empty where unknown."""
         value, half = value_and_interval(value_nm, SIGMA_95 * (shape(self.status or {}).torque_std_nm or 0.0))
         return (value, f" ± {half}") if half else (self._torque(value_nm), "")
 

@@ -64,15 +64,17 @@ impl Blocks {
 
     /// Where the zero between the encoders is, is not known any more.
     pub fn lose_zero(&mut self) {
-        let found = self.located && !self.doubting && !self.is_unconfirmed() && self.is_explained();
+        let explained = self.is_explained();
+        let found = self.located && !self.doubting && !self.is_unconfirmed() && explained;
         let guessed = self.zero_torque(self.spring.curve(0.0).1) > USEFUL * self.torque;
+        // What was learned without a zero may be of another one.
+        let before = self.before.as_ref().filter(|_| self.lost && !found);
         if self.are_few() && self.before.is_none() {
             self.spring.reset(); // a few blocks have taught nothing: their zero may have been another one, too
-        } else if let Some(before) =
-            self.before.as_ref().filter(|one| self.lost && !found && one.knows_spring())
-        {
-            // What was learned without a zero may be of another one: as it was before.
+        } else if let Some(before) = before.filter(|before| before.knows_spring()) {
             self.spring.alpha[..TERMS].copy_from_slice(&before.x[SPRING]);
+        } else if before.is_some() && !explained {
+            self.spring.reset();
         } else {
             self.carry_over(1 << ZERO | 1 << DRY | 1 << SOFT | !(anywhere() | set(SPRING)));
             if guessed {
@@ -125,12 +127,13 @@ impl Blocks {
     /// where it is then.
     fn tried(&self, before: &Before, spring: &Spring, total: &Gram, step: f64) -> [(f64, f64); TRIED] {
         let ([low, high], mut tried) = (self.seen, spring.clone());
+        let middle = 0.5 * (low + high);
         let powers =
             set(SPRING.start..SPRING.start + spring.least) | self.before.as_ref().map_or(0, |one| one.set);
         let asked = ACTIVE & !(set(SPRING) & !powers);
         let projection = Projection::between(&self.family, self.deflection, low, high);
         std::array::from_fn(|k| {
-            tried.zero = step * (k as f64 - f64::from(ZEROS));
+            tried.zero = step * (k as f64 - f64::from(ZEROS)) - middle;
             let nothing = (f64::NEG_INFINITY, tried.zero);
             if (tried.zero + low).abs().max((tried.zero + high).abs()) > REACHED * tried.reach() {
                 return nothing;
@@ -227,6 +230,43 @@ mod tests {
             (blocks.spring.alpha[0], blocks.spring.zero) = (factor * from.alpha[0], off);
             blocks.place_zero(false, 0.0, &from, &known);
             assert_eq!(blocks.placed, placed, "{factor} {off}");
+        }
+    }
+
+    /// A VSA-II that has lost its zero, of which only the inertia is known from before.
+    fn lost() -> Blocks {
+        let mut blocks = declared();
+        let (mut x, mut precision) = ([0.0; UNKNOWNS], [[0.0; UNKNOWNS]; UNKNOWNS]);
+        (x[INERTIA], precision[INERTIA][INERTIA]) = (1e-3, 1e10);
+        let before = Before { x, precision, set: 1 << INERTIA, deflection: 0.4, unexplained: 0.001 };
+        (blocks.before, blocks.lost, blocks.deflection) = (Some(before), true, 0.9);
+        blocks
+    }
+
+    #[test]
+    fn a_lost_zero_is_sought_wherever_it_leaves_the_deflections_within_those_known() {
+        let mut blocks = lost();
+        for [low, high] in [[-0.66, -0.32], [-0.05, 0.01], [0.3, 0.5]] {
+            blocks.seen = [low, high];
+            let before = blocks.before.as_ref().unwrap();
+            let step = before.deflection / f64::from(ZEROS);
+            let tried = blocks.tried(before, &blocks.spring, &Gram::default(), step).map(|(_, zero)| zero);
+            assert!(tried[0] < step - before.deflection - low, "{tried:?}");
+            assert!(tried[TRIED - 1] > before.deflection - high - step, "{tried:?}");
+        }
+    }
+
+    #[test]
+    fn what_a_zero_that_explains_nothing_has_taught_is_not_carried_over() {
+        for (unexplained, carried) in [(0.001, true), (0.5, false)] {
+            let (mut blocks, set) = (lost(), 1 << INERTIA | set(SPRING));
+            let mut covariance = [[0.0; UNKNOWNS]; UNKNOWNS];
+            (0..UNKNOWNS).for_each(|i| covariance[i][i] = 1e-8);
+            blocks.posterior = Some(Posterior::believed(set, [0.0; UNKNOWNS], covariance));
+            (blocks.spring.alpha[0], blocks.unexplained, blocks.fluctuation) = (-0.6, unexplained, 1.0);
+            blocks.lose_zero();
+            assert_eq!(blocks.before.as_ref().unwrap().knows_spring(), carried);
+            assert_eq!(blocks.spring.alpha[0] == 0.5, !carried);
         }
     }
 }

@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import joints
 import numpy as np
+import onlinekit as kit
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -166,6 +167,28 @@ def test_a_frozen_channel_is_noticed_and_survived(rig, channel):
     assert np.mean(status[4100:4800] & Status.INPUT_REJECTED > 0) > 0.9
     assert not np.any(status[4100:4800] & Status.VALID)
     assert np.median(np.abs(out[6500:, 3] / rig.truth.sigma[6500:, 0, 0] - 1)) < 0.01
+
+
+@pytest.mark.parametrize(("name", "rest_s"), [("quadratic", 0.0), ("vsa-ii", 0.0), ("vsa-ii", 3.0)])
+def test_a_drive_that_hangs_in_the_first_second_of_motion_is_noticed(name, rest_s):
+    """How long readings repeat is learned from their changes in motion: neither at rest nor from what hangs."""
+    motion, rest = kit.motion(name, 7.0, seed=8), round(rest_s / kit.PERIOD_S)
+    first, hung = motion.samples[0], motion.samples[955]
+    estimator = kit.make_estimator(kit.declared(name), kit.EstimatorSettings(), kit.PERIOD_S)
+    for k in range(rest):
+        estimator.step(first._replace(sequence=k))
+    valid = []
+    for k, sample in enumerate(motion.samples):
+        if 955 <= k < 1755:
+            sample = sample._replace(
+                motor_position_rad=(*sample.motor_position_rad[:-1], hung.motor_position_rad[-1]),
+                motor_torque_nm=(*sample.motor_torque_nm[:-1], hung.motor_torque_nm[-1]),
+            )
+        one = estimator.step(sample._replace(sequence=rest + k))
+        valid.append(one.status & kit.VALID)
+        off = abs(one.stiffness_nm_rad / motion.stiffness_nm_rad[k] - 1.0)
+        assert not valid[-1] or off < max(0.1, 3.0 * one.stiffness_std_nm_rad / motion.stiffness_nm_rad[k]), k
+    assert not any(valid[980:1755]) and any(valid[-1000:])
 
 
 def test_an_encoder_that_moves_its_zero_is_followed(rig):

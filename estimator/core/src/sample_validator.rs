@@ -39,8 +39,8 @@ pub struct Accepted {
 /// out and bridged; where the new place persists, it is the encoder's zero that has moved, and the filters
 /// start anew from there. After a gap a place that no velocity seen so far leads to is a jump, too. A torque
 /// may jump, but one that would throw the bare motor about and is many times the largest one seen is left
-/// out unless it persists. A channel is frozen when it repeats itself exactly for longer than it has ever
-/// done in good times, while a position moves; a position only if it stopped dead, sooner than friction can: a link
+/// out unless it persists. A channel is frozen when it repeats itself exactly for three times as long as
+/// between two changes in the first motion, while a position moves; a position only if it stopped dead, sooner than friction can: a link
 /// that comes to rest while the motors go on, as under a controller, is no fault, nor is a motor that friction stops.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SampleValidator {
@@ -81,6 +81,7 @@ struct Memory {
     wild: u32,
     seen: u32,
     samples: u32,
+    moved: u32, // samples of motion from which standing still was learned
     rejected: u32,
     motion: f64,
     frozen: bool,
@@ -105,6 +106,7 @@ const FRESH: Memory = Memory {
     wild: 0,
     seen: 0,
     samples: 0,
+    moved: 0,
     rejected: 0,
     motion: 0.0,
     frozen: false,
@@ -152,11 +154,11 @@ impl SampleValidator {
         self.trail.iter_mut().for_each(|places| *places = [f64::NAN; PLACES]);
     }
 
-    /// Positions may count from anywhere after this; torques are as before.
+    /// Positions may count from anywhere after this; torques, and how long readings repeat, are as before.
     pub fn lose_zeros(&mut self) {
-        let Memory { torque, largest, .. } = self.memory;
+        let Memory { torque, largest, usual, moved, .. } = self.memory;
         self.reset();
-        (self.memory.torque, self.memory.largest) = (torque, largest);
+        self.memory = Memory { torque, largest, usual, moved, ..FRESH };
     }
 
     /// Smallest change of each position (motors, then the link) or of its changes: its resolution, rad; ∞ before any.

@@ -10,6 +10,8 @@ use crate::suspicion::{Reason, Signal};
 /// Of a position: what arithmetic, or a text of ten digits, leaves of counts that cancel …
 const ROUNDING: f64 = 4e-9;
 const SINGLE: f64 = 2.5e-7; // … and of one in single precision
+const FINEST: f64 = 1e-6; // of a change: no joint moves by a million counts in a period
+const MOVING: f64 = 0.2; // share of the last 20 samples in which a position has changed
 
 impl SampleValidator {
     /// Whether a channel is frozen: everything at rest is no fault, one encoder count now and then no motion.
@@ -26,31 +28,34 @@ impl SampleValidator {
         };
         let bend = self.gain / FAR * m.torque; // what the torque makes of a motor's way in a period
         let (mut moving, mut still) = (0.0, None);
+        let learns = m.motion > MOVING && m.moved < self.learning;
+        m.moved += u32::from(learns);
         for i in 0..count {
+            let run = m.runs[i] + 1;
             if values[i] == old[i] {
-                m.runs[i] += 1;
-                let run = m.runs[i];
+                m.runs[i] = run;
                 if run == 1 && i < watched {
                     m.stopped_dead[i] = stops_dead(&self.trail, i, m.steps[i], bend);
                 }
-                if m.samples < self.learning {
-                    m.usual[i] = m.usual[i].max(run);
-                }
                 // A torque always counts as one that was moving before.
-                if run > self.still && run > 3 * m.usual[i] && (i >= watched || m.stopped_dead[i]) {
+                let longer = m.usual[i] > 0 && run > self.still.max(3 * m.usual[i]);
+                if longer && (i >= watched || m.stopped_dead[i]) {
                     still = Some(i);
                 }
             } else {
-                m.runs[i] = 0;
                 if i < watched {
                     moving = 1.0;
                 }
+                if learns {
+                    m.usual[i] = m.usual[i].max(run);
+                }
+                m.runs[i] = 0;
             }
         }
         self.trail.pop_front();
         self.trail.push_back(*places);
         m.motion += 0.05 * (moving - m.motion);
-        m.frozen = still.is_some() && m.motion > 0.2;
+        m.frozen = still.is_some() && m.motion > MOVING;
         let frozen = m.frozen;
         if let Some(place) = still.filter(|_| frozen) {
             self.found = Some((self.signal(place), Reason::Frozen));
@@ -84,8 +89,9 @@ impl SampleValidator {
             let second = if m.seen > 0 && periods == m.span { bend * periods } else { 0.0 };
             let place = places[i];
             let rounding = if f64::from(place as f32) == place { SINGLE } else { ROUNDING };
+            let least = (rounding * place.abs()).max(FINEST * size);
             for count in [size, second] {
-                if count > rounding * place.abs() && count < m.steps[i] {
+                if count > least && count < m.steps[i] {
                     m.steps[i] = count;
                 }
             }
@@ -133,11 +139,11 @@ mod tests {
         let count = std::f64::consts::TAU / 8000.0;
         let text = |x: f64| format!("{x:.9}").parse::<f64>().unwrap();
         let single = |x: f64| f64::from(x as f32);
-        for written in [text as fn(f64) -> f64, single] {
+        for (written, middle) in [(text as fn(f64) -> f64, 1.5), (text, 0.0), (single, 1.5)] {
             let mut validator = SampleValidator::new(&model, 1e-3);
             for k in 0..5000_u64 {
                 let t = 1e-3 * k as f64;
-                let q = written(((1.5 + (2.0 * t).sin()) / count).round() * count);
+                let q = written(((middle + (2.0 * t).sin()) / count).round() * count);
                 let sample = Sample {
                     sequence: k,
                     motor_position: [q; MOTORS],

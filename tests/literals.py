@@ -99,6 +99,8 @@ NUMERIC = {
     "noise.rs THIRD": "third differences of white noise have 20 times its variance",
     "paper.rs SIGMA_95": "quantile of the normal distribution",
     "sample_validator/channels.rs ROUNDING": "what arithmetic, or a text of ten digits, leaves of counts that cancel",
+    "sample_validator/channels.rs FINEST": "no joint moves by a million counts in a period",
+    "sample_validator/channels.rs MOVING": "a change in each of the last five samples is motion, one now and then none",
     "sample_validator/channels.rs SINGLE": "what single precision leaves of them",
     "spring.rs RIDGE": "keeps rounding from deciding between parallel functions",
     "unknowns.rs NARROWEST": "end of a grid of shapes that is refined afterwards",

@@ -1,3 +1,4 @@
+# Attributes are read only, but for `SdoTransfers.changes`.
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -61,29 +62,17 @@ class JsonNumbers:
         """
 
 class NodeCounters:
-    """What became of one node's frames since the start.
+    """What became of one node's frames since the start."""
 
-    Attributes:
-        received: PDOs of this node that were used.
-        missing: frames that had not come when the next SYNC came.
-        late: of these, frames that came in the cycle after.
-        duplicate: frames beyond the one a cycle needs.
-        conflicting: of the cycles with such frames, those in which they differed; not used.
-        wrong_length: frames that do not carry what is mapped; not used.
-        ignored: frames sent after a reboot, before the node was configured and started again.
-        reboots: boot-up messages.
-        emergencies: EMCY messages that report an error.
-    """
-
-    received: int
-    missing: int
-    late: int
-    duplicate: int
-    conflicting: int
-    wrong_length: int
-    ignored: int
-    reboots: int
-    emergencies: int
+    received: int  # PDOs of this node that were used
+    missing: int  # frames that had not come when the next SYNC came
+    late: int  # of these, frames that came in the cycle after
+    duplicate: int  # frames beyond the one a cycle needs
+    conflicting: int  # of the cycles with such frames, those in which they differed; not used
+    wrong_length: int  # frames that do not carry what is mapped; not used
+    ignored: int  # frames sent after a reboot, before the node was configured and started again
+    reboots: int  # boot-up messages
+    emergencies: int  # EMCY messages that report an error
 
     def as_dict(self) -> dict[str, int]:
         """All of them, by name."""
@@ -107,24 +96,24 @@ class Assembler:
             configure is not believed any more, since it may have lost its mapping meanwhile.
         period_s: communication cycle.
 
-    Attributes:
-        sequence: number of the current SYNC, from 0; -1 before the first.
-        missed: number of the cycle the last SYNC closed without a sample, or -1 if it had one.
-        flags: service bits of `Status` that hold for the sample just given, or the cycle just missed.
-        cob_ids: identifiers that concern this joint, SYNC aside.
-        counters: by node id, as they are now.
-        faults: nodes that report a fault, with the EMCY error code (0: by statusword only).
-        statuswords: of the drives, as last heard, by node id.
-        untrusted: nodes that rebooted or were silent for long, and have not been started again.
-        checks: two readings of one quantity, where both are mapped: (motor from 1 on, "velocity", "current",
-            "second_encoder" or "following_error", "untested", "agrees" or "contradicts", scale of the second
-            reading against the first, its standard deviation).
-        has_link: whether any frame carries the link position.
-        complete: whether this cycle has given its sample: nothing more is expected before the next SYNC.
-
     Raises:
         DriveError: two frames with one identifier, or a motor without position or torque.
     """
+
+    sequence: int  # number of the current SYNC, from 0; -1 before the first
+    missed: int  # number of the cycle the last SYNC closed without a sample, or -1 if it had one
+    flags: int  # service bits of `Status` that hold for the sample just given, or the cycle just missed
+    cob_ids: tuple[int, ...]  # identifiers that concern this joint, SYNC aside
+    counters: dict[int, NodeCounters]  # by node id, as they are now
+    faults: dict[int, int]  # nodes that report a fault, with the EMCY error code (0: by statusword only)
+    statuswords: dict[int, int]  # of the drives, as last heard, by node id
+    untrusted: tuple[int, ...]  # nodes that rebooted or were silent for long, and have not been started again
+    # two readings of one quantity, where both are mapped: (motor from 1 on, "velocity", "current",
+    # "second_encoder" or "following_error", "untested", "agrees" or "contradicts", scale of the second
+    # reading against the first, its standard deviation)
+    checks: list[tuple[int, str, str, float, float]]
+    has_link: bool  # whether any frame carries the link position
+    complete: bool  # whether this cycle has given its sample: nothing more is expected before the next SYNC
 
     def __init__(
         self,
@@ -135,28 +124,6 @@ class Assembler:
         hold_periods: int = 250,
         period_s: float = 0.001,
     ) -> None: ...
-    @property
-    def sequence(self) -> int: ...
-    @property
-    def missed(self) -> int: ...
-    @property
-    def flags(self) -> int: ...
-    @property
-    def cob_ids(self) -> tuple[int, ...]: ...
-    @property
-    def counters(self) -> dict[int, NodeCounters]: ...
-    @property
-    def faults(self) -> dict[int, int]: ...
-    @property
-    def statuswords(self) -> dict[int, int]: ...
-    @property
-    def untrusted(self) -> tuple[int, ...]: ...
-    @property
-    def checks(self) -> list[tuple[int, str, str, float, float]]: ...
-    @property
-    def has_link(self) -> bool: ...
-    @property
-    def complete(self) -> bool: ...
     def feed(self, cob_id: int, data: bytes, jump: int = 1) -> Sample | None:
         """Take one frame in the order of the bus, SYNC included; the sample that it completes, if it does.
 
@@ -187,20 +154,11 @@ class Assembler:
         """
 
 class McapMessage:
-    """One message of an MCAP file.
+    """One message of an MCAP file."""
 
-    Attributes:
-        topic: its channel's.
-        log_time_ns: its time.
-        data: its content.
-    """
-
-    @property
-    def topic(self) -> str: ...
-    @property
-    def log_time_ns(self) -> int: ...
-    @property
-    def data(self) -> bytes: ...
+    topic: str  # its channel's
+    log_time_ns: int  # its time
+    data: bytes  # its content
 
 class BlfFrames:
     """The frames in the containers of a BLF file.
@@ -226,21 +184,15 @@ class McapMessages:
 
     Args:
         topics: last parts of the topics of interest (`sample` for `/elbow/sample`); None: all.
-
-    Attributes:
-        count: records up to here; a sample or an estimate counts twice, as no joint at rest has them in less
-            than twice the bytes of a frame.
-        stamp_ns: of the last message.
-        broken: whether a record was damaged.
     """
 
+    # records up to here; a sample or an estimate counts twice, as no joint at rest has them in less than
+    # twice the bytes of a frame
+    count: int
+    stamp_ns: int  # of the last message
+    broken: bool  # whether a record was damaged
+
     def __init__(self, topics: frozenset[str] | None) -> None: ...
-    @property
-    def count(self) -> int: ...
-    @property
-    def stamp_ns(self) -> int: ...
-    @property
-    def broken(self) -> bool: ...
     def take(self, records: bytes, most: int) -> McapMessages:
         """Go on with further records, and end where there are more than `most` in all."""
 
@@ -252,35 +204,18 @@ class SdoTransfers:
 
     Args:
         interesting: whether to keep the value of an object (index, subindex).
-
-    Attributes:
-        values: confirmed unsigned values by (index, subindex).
-        written: those of them that were written, not read.
-        disputed: objects with two different answers to one request, or a download that was given up.
-        changes: number of new, changed, forgotten and disputed values.
     """
 
-    changes: int
+    changes: int  # number of new, changed, forgotten and disputed values
+    values: dict[tuple[int, int], int]  # confirmed unsigned values by (index, subindex)
+    written: set[tuple[int, int]]  # those of them that were written, not read
+    # objects with two different answers to one request, or a download that was given up
+    disputed: set[tuple[int, int]]
+    unasked: int  # answers that belong to no request
+    pending: tuple[int, int] | None  # the object being written, not yet confirmed
+    is_mapping: bool  # whether that is a parameter of a TPDO
 
     def __init__(self, interesting: Callable[[int, int], bool], timeout_s: float) -> None: ...
-    @property
-    def values(self) -> dict[tuple[int, int], int]: ...
-    @property
-    def written(self) -> set[tuple[int, int]]: ...
-    @property
-    def disputed(self) -> set[tuple[int, int]]: ...
-    @property
-    def unasked(self) -> int:
-        """Answers that belong to no request."""
-
-    @property
-    def pending(self) -> tuple[int, int] | None:
-        """The object being written, not yet confirmed."""
-
-    @property
-    def is_mapping(self) -> bool:
-        """Whether that is a parameter of a TPDO."""
-
     def drop_transfer(self) -> None:
         """Forget the present transfer."""
 
@@ -295,16 +230,13 @@ class SyncNumbering:
 
     Args:
         measure: called with the stamps of the first SYNCs and the period; returns the period to be used.
-
-    Attributes:
-        period_s: in use.
     """
+
+    period_s: float  # in use
 
     def __init__(
         self, period_s: float, measure: Callable[[Sequence[int], float], float] | None = None
     ) -> None: ...
-    @property
-    def period_s(self) -> float: ...
     def push(self, frame: LoggedFrame) -> tuple[Sequence[LoggedFrame], int] | None:
         """Process a frame; return what is decided now, see `Numbered`."""
 
@@ -312,14 +244,10 @@ class SyncNumbering:
         """Return the first of what waits, after the end of the stream; None: nothing."""
 
 class LatencyHistogram:
-    """A distribution of durations: counts per microsecond up to 5 ms, and the maximum.
+    """A distribution of durations: counts per microsecond up to 5 ms, and the maximum."""
 
-    Attributes:
-        count: durations since the start.
-    """
+    count: int  # durations since the start
 
-    @property
-    def count(self) -> int: ...
     def add(self, duration_ns: int) -> None:
         """Count one duration."""
 
@@ -330,44 +258,20 @@ class LatencyHistogram:
         """The same since the last call; empty where nothing was counted."""
 
 class Tick:
-    """What is published of one cycle.
+    """What is published of one cycle."""
 
-    Attributes:
-        sequence: number of its SYNC.
-        status: bits of `Status`.
-        stamp_ns: UNIX time of its SYNC.
-        current: whether it is the cycle of the last SYNC.
-        fresh: whether it has a sample; else the last estimate is carried on.
-        estimate: as an object.
-        external: likewise; None where nothing is declared of the link.
-        sample: likewise; None where it is not fresh.
-        estimate_payload: the bytes of `<prefix>/<joint>/estimate`.
-        external_payload: the bytes of `<prefix>/<joint>/external`; None where there is none.
-        sample_payload: the bytes of `<prefix>/<joint>/sample`; None where it is not fresh.
-    """
+    sequence: int  # number of its SYNC
+    status: int  # bits of `Status`
+    stamp_ns: int  # UNIX time of its SYNC
+    current: bool  # whether it is the cycle of the last SYNC
+    fresh: bool  # whether it has a sample; else the last estimate is carried on
+    estimate: Estimate  # as an object
+    external: External | None  # likewise; None where nothing is declared of the link
+    sample: Sample | None  # likewise; None where it is not fresh
+    estimate_payload: bytes  # the bytes of `<prefix>/<joint>/estimate`
+    external_payload: bytes | None  # the bytes of `<prefix>/<joint>/external`; None where there is none
+    sample_payload: bytes | None  # the bytes of `<prefix>/<joint>/sample`; None where it is not fresh
 
-    @property
-    def sequence(self) -> int: ...
-    @property
-    def status(self) -> int: ...
-    @property
-    def stamp_ns(self) -> int: ...
-    @property
-    def current(self) -> bool: ...
-    @property
-    def fresh(self) -> bool: ...
-    @property
-    def estimate(self) -> Estimate: ...
-    @property
-    def external(self) -> External | None: ...
-    @property
-    def sample(self) -> Sample | None: ...
-    @property
-    def estimate_payload(self) -> bytes: ...
-    @property
-    def external_payload(self) -> bytes | None: ...
-    @property
-    def sample_payload(self) -> bytes | None: ...
     def flagged(self, status: int) -> Tick:
         """The same with these status bits set too."""
 
@@ -395,19 +299,18 @@ class JointPipeline:
         estimator: steps once a sample.
         model_monitor: raises the model alarm, if there is one.
         keep: how many of the last samples are kept, for a new estimator to start from.
-
-    Attributes:
-        assembler: as given.
-        estimator: the one in use.
-        model_monitor: likewise.
-        history: the last samples.
-        estimate: the last one, None before the first.
-        status: its bits of `Status`, likewise.
-        external: likewise; None too where nothing is declared of the link.
-        sample: what the last estimate was made from; None where it was carried on.
-        missed: cycles that gave no sample.
-        complete: as of the assembler.
     """
+
+    assembler: Assembler  # as given
+    estimator: Estimator  # the one in use
+    model_monitor: ModelMonitor | None  # likewise
+    history: History  # the last samples
+    estimate: Estimate | None  # the last one, None before the first
+    status: int | None  # its bits of `Status`, likewise
+    external: External | None  # likewise; None too where nothing is declared of the link
+    sample: Sample | None  # what the last estimate was made from; None where it was carried on
+    missed: int  # cycles that gave no sample
+    complete: bool  # as of the assembler
 
     def __init__(
         self,
@@ -417,26 +320,6 @@ class JointPipeline:
         *,
         keep: int = 0,
     ) -> None: ...
-    @property
-    def assembler(self) -> Assembler: ...
-    @property
-    def estimator(self) -> Estimator: ...
-    @property
-    def model_monitor(self) -> ModelMonitor | None: ...
-    @property
-    def history(self) -> History: ...
-    @property
-    def estimate(self) -> Estimate | None: ...
-    @property
-    def status(self) -> int | None: ...
-    @property
-    def external(self) -> External | None: ...
-    @property
-    def sample(self) -> Sample | None: ...
-    @property
-    def missed(self) -> int: ...
-    @property
-    def complete(self) -> bool: ...
     def feed(
         self, cob_id: int, data: bytes, jump: int = 1, stamp_ns: int = 0, late_ns: int = 0
     ) -> Tick | None:

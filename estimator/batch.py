@@ -109,23 +109,16 @@ class TransmissionFit:
 
 
 class JointFit(NamedTuple):
-    """A fitted joint.
+    """A fitted joint."""
 
-    Attributes:
-        search: the effects that may be missing.
-        surplus: mean square of the errors on held-out data over that on the fitted data, see `Held.surplus`.
-        fitted: the hypothesis.
-        covariance: (k, k) of its parameters; includes the uncertainty whether a reading has an error at all.
-        absent: optional errors that the data do not support.
-        doubts: time stamps that may be wrong, one line each.
-    """
-
-    search: Search
+    search: Search  # the effects that may be missing
+    # mean square of the errors on held-out data over that on the fitted data, see `Held.surplus`
     surplus: float
-    fitted: Fitted
+    fitted: Fitted  # the hypothesis
+    # (k, k) of its parameters; includes the uncertainty whether a reading has an error at all
     covariance: FloatArray
-    absent: frozenset[Key] = frozenset()
-    doubts: tuple[str, ...] = ()
+    absent: frozenset[Key] = frozenset()  # optional errors that the data do not support
+    doubts: tuple[str, ...] = ()  # time stamps that may be wrong, one line each
 
     @property
     def problem(self) -> Problem:

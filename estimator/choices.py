@@ -16,19 +16,12 @@ __all__ = ["CHOICES", "ON_LINE", "Choice", "chance", "choice", "least_rows", "lo
 
 
 class Choice(NamedTuple):
-    """A chosen number.
+    """A chosen number."""
 
-    Attributes:
-        value: in its unit.
-        unit: "" for a plain number.
-        meaning: what it sets.
-        reason: why this much.
-    """
-
-    value: float
-    unit: str
-    meaning: str
-    reason: str
+    value: float  # in its unit
+    unit: str  # "" for a plain number
+    meaning: str  # what it sets
+    reason: str  # why this much
 
 
 ON_LINE = {row[0].lower(): Choice(*row[1:]) for row in _core.CHOICES}

@@ -19,17 +19,11 @@ __all__ = ["Correlation", "Curve", "correlations", "friction_curve", "stiffness_
 
 
 class Correlation(NamedTuple):
-    """Normalised correlation over lags, and half the 95 % band of none.
+    """Normalised correlation over lags, and half the 95 % band of none."""
 
-    Attributes:
-        lag_s: (n,); the residual is later than the torque by it.
-        value: (n,) from -1 to 1.
-        band: 1.96 standard deviations of what chance makes (Bartlett).
-    """
-
-    lag_s: FloatArray
-    value: FloatArray
-    band: float
+    lag_s: FloatArray  # (n,); the residual is later than the torque by it
+    value: FloatArray  # (n,) from -1 to 1
+    band: float  # 1.96 standard deviations of what chance makes (Bartlett)
 
 
 class Curve(NamedTuple):

@@ -20,17 +20,12 @@ _STEP = 1e-6  # rad
 
 
 class Path(NamedTuple):
-    """Motions side by side, each (n, w, m): positions in rad of m motors over n moments in w motions.
+    """Motions side by side, each (n, w, m): of m motors over n moments in w motions."""
 
-    Attributes:
-        position, velocity, acceleration: in rad, rad/s, rad/s².
-        period_s: between two moments.
-    """
-
-    position: FloatArray
-    velocity: FloatArray
-    acceleration: FloatArray
-    period_s: float
+    position: FloatArray  # rad
+    velocity: FloatArray  # rad/s
+    acceleration: FloatArray  # rad/s²
+    period_s: float  # between two moments
 
     def one(self, k: int) -> Path:
         """Return one of the motions."""

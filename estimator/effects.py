@@ -39,79 +39,47 @@ Channel = Literal["torque", "motor_torque", "deflection", "link_position"]
 
 
 class Coordinates(NamedTuple):
-    """Coordinates that a term may depend on: numbers of one tick, or equally filtered arrays of a recording.
+    """What a term may depend on: numbers of one tick, or equally filtered arrays of a recording."""
 
-    Attributes:
-        position: theta, rad.
-        velocity: theta', rad/s.
-        acceleration: theta'', rad/s².
-        deflection: phi = q - theta, rad.
-        deflection_rate: phi', rad/s.
-        flexibility_torque: tau_e(phi), N·m.
-        stiffness: d tau_e / d phi, N·m/rad.
-        torque: the motor's measured torque tau, N·m.
-        torque_rate: its derivative, N·m/s.
-        link_position: q, rad.
-        link_velocity: q', rad/s.
-        link_acceleration: q'', rad/s².
-        time: since the start, s.
-    """
-
-    position: Any
-    velocity: Any
-    acceleration: Any
-    deflection: Any
-    deflection_rate: Any
-    flexibility_torque: Any
-    stiffness: Any
-    torque: Any
-    torque_rate: Any
-    link_position: Any
-    link_velocity: Any
-    link_acceleration: Any
-    time: Any
+    position: Any  # theta, rad
+    velocity: Any  # theta', rad/s
+    acceleration: Any  # theta'', rad/s²
+    deflection: Any  # phi = q - theta, rad
+    deflection_rate: Any  # phi', rad/s
+    flexibility_torque: Any  # tau_e(phi), N·m
+    stiffness: Any  # d tau_e / d phi, N·m/rad
+    torque: Any  # the motor's measured torque tau, N·m
+    torque_rate: Any  # its derivative, N·m/s
+    link_position: Any  # q, rad
+    link_velocity: Any  # q', rad/s
+    link_acceleration: Any  # q'', rad/s²
+    time: Any  # since the start, s
 
 
 class Parameter(NamedTuple):
-    """One parameter of an effect.
+    """One parameter of an effect."""
 
-    Attributes:
-        name: with its unit, as it stands in a joint file.
-        meaning: in words.
-        linear: whether the effect is proportional to it; the k-th linear parameter weighs the k-th term.
-        positive: whether it is not negative, as of what only dissipates.
-        default: value used if the joint file omits it; None: required.
-    """
-
-    name: str
-    meaning: str
-    linear: bool
-    positive: bool
-    default: float | None
+    name: str  # with its unit, as it stands in a joint file
+    meaning: str  # in words
+    linear: bool  # whether the effect is proportional to it; the k-th linear parameter weighs the k-th term
+    positive: bool  # whether it is not negative, as of what only dissipates
+    default: float | None  # value used if the joint file omits it; None: required
 
 
 @dataclass(frozen=True, slots=True)
 class EffectType:
-    """One kind of effect.
+    """One kind of effect."""
 
-    Attributes:
-        name: as in joint files and reports.
-        location: the part of the joint it belongs to.
-        channel: what it acts on: the torque balance of its location; the motor torque's measurement; the
-            deflection (the zero between the encoders); the link encoder's reading.
-        coordinates: the fields of `Coordinates` that it depends on; first the one that reveals it.
-        parameters: its parameters.
-        remembers: whether it has memory (hysteresis).
-        description: for reports, in a few words.
-    """
-
-    name: str
-    location: Location
+    name: str  # as in joint files and reports
+    location: Location  # the part of the joint it belongs to
+    # what it acts on: the torque balance of its location; the motor torque's measurement; the deflection
+    # (the zero between the encoders); the link encoder's reading
     channel: Channel
+    # the fields of `Coordinates` that it depends on; first the one that reveals it
     coordinates: tuple[str, ...]
-    parameters: tuple[Parameter, ...]
-    remembers: bool
-    description: str
+    parameters: tuple[Parameter, ...]  # its parameters
+    remembers: bool  # whether it has memory (hysteresis)
+    description: str  # for reports, in a few words
 
     @property
     def linear(self) -> tuple[str, ...]:

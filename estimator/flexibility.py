@@ -36,18 +36,12 @@ class TransmissionModel:
     """f(phi, alpha) = sum_h basis_h(phi, shape) * alpha_h, with alpha = (linear coefficients, shape).
 
     One linear coefficient k unless a subclass says otherwise: f = k g(phi, shape).
-
-    Attributes:
-        name: as in the joint file.
-        law: its evaluation over arrays.
-        linear: number of leading entries of alpha that enter linearly; None: all.
-        shape_names: names of the remaining entries ("shape"), which enter nonlinearly.
     """
 
-    name: str
-    law: TransmissionLaw
-    linear: int | None = 1
-    shape_names: tuple[str, ...] = ()
+    name: str  # as in the joint file
+    law: TransmissionLaw  # its evaluation over arrays
+    linear: int | None = 1  # number of leading entries of alpha that enter linearly; None: all
+    shape_names: tuple[str, ...] = ()  # names of the remaining entries ("shape"), which enter nonlinearly
 
     @property
     def shape_bounds(self) -> tuple[tuple[float, float], ...]:

@@ -33,27 +33,19 @@ Element = tuple[EffectType, Mapping[str, float]]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FreeRun:
-    """Measured and simulated positions.
+    """Measured and simulated positions."""
 
-    Attributes:
-        time_s: (n,).
-        measured_rad: (n, c), by column of `channels`.
-        simulated_rad: (n, c).
-        channels: "motor1_position", …, "link_position" where the link is simulated, "motor1_deflection", ….
-        horizon_s: time between new starts from the measured state.
-        fit_percent: NRMSE fit of each channel, 100 (1 - |y - y_sim| / |y - mean y|), as MATLAB's `compare`.
-        coasting_percent: the same of motion at constant velocity from the same starts: what no model reaches
-            for nothing.
-        as_measured: effects with memory, which act along the measured motion instead of the simulated one.
-    """
-
-    time_s: FloatArray
-    measured_rad: FloatArray
-    simulated_rad: FloatArray
+    time_s: FloatArray  # (n,)
+    measured_rad: FloatArray  # (n, c), by column of `channels`
+    simulated_rad: FloatArray  # (n, c)
+    # "motor1_position", …, "link_position" where the link is simulated, "motor1_deflection", …
     channels: tuple[str, ...]
-    horizon_s: float
+    horizon_s: float  # time between new starts from the measured state
+    # NRMSE fit of each channel, 100 (1 - |y - y_sim| / |y - mean y|), as MATLAB's `compare`
     fit_percent: Mapping[str, float]
+    # the same of motion at constant velocity from the same starts: what no model reaches for nothing
     coasting_percent: Mapping[str, float]
+    # effects with memory, which act along the measured motion instead of the simulated one
     as_measured: tuple[str, ...]
 
     @property

@@ -47,23 +47,15 @@ class RecordingFit(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identified:
-    """A joint, fitted to recordings.
+    """A joint, fitted to recordings."""
 
-    Attributes:
-        fits: of each motor; its numbers agree with those in `model`.
-        model: the joint with fitted transmissions, inertias, dampings, link and readings.
-        link_std: standard deviations of the link's dynamics, by name.
-        recordings: residual of each recording.
-        surplus: mean square of the errors on held-out data over that on the fitted data.
-        notes: remarks on the numbers, one line each.
-    """
-
-    fits: list[TransmissionFit]
-    model: JointModel
+    fits: list[TransmissionFit]  # of each motor; its numbers agree with those in `model`
+    model: JointModel  # the joint with fitted transmissions, inertias, dampings, link and readings
+    # standard deviations of the link's dynamics, by name
     link_std: dict[str, float] = field(default_factory=dict)
-    recordings: tuple[RecordingFit, ...] = ()
-    surplus: float = 1.0
-    notes: tuple[str, ...] = ()
+    recordings: tuple[RecordingFit, ...] = ()  # residual of each recording
+    surplus: float = 1.0  # mean square of the errors on held-out data over that on the fitted data
+    notes: tuple[str, ...] = ()  # remarks on the numbers, one line each
 
 
 def identify(

@@ -36,19 +36,14 @@ _NOTHING = 1e-12  # N·m: keeps the logarithm of a second without residual or to
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResidualBaseline:
-    """Residual of a sufficient model in each balance, from the seconds of a healthy recording.
+    """Residual of a sufficient model in each balance, from the seconds of a healthy recording."""
 
-    Attributes:
-        residual_nm: (motors, then the link where its dynamics are known) usual rms of a second.
-        torque_nm: rms of each balance's torque in these seconds; the limit rises with the torque.
-        log_std: standard deviation of the logarithm of a second's mean square.
-        seconds: number of seconds.
-    """
-
+    # (motors, then the link where its dynamics are known) usual rms of a second
     residual_nm: tuple[float, ...]
+    # rms of each balance's torque in these seconds; the limit rises with the torque
     torque_nm: tuple[float, ...]
-    log_std: tuple[float, ...]
-    seconds: int
+    log_std: tuple[float, ...]  # standard deviation of the logarithm of a second's mean square
+    seconds: int  # number of seconds
 
     def __post_init__(self) -> None:
         sizes = {len(self.residual_nm), len(self.torque_nm), len(self.log_std)}

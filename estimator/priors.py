@@ -21,19 +21,12 @@ Scale = Literal[
 
 
 class Prior(NamedTuple):
-    """A Gaussian prior about what is declared (zero where nothing is declared).
+    """A Gaussian prior about what is declared (zero where nothing is declared)."""
 
-    Attributes:
-        std: standard deviation, as a fraction of the scale.
-        scale: what it is a share of.
-        meaning: the quantity.
-        reason: why this wide.
-    """
-
-    std: float
-    scale: Scale
-    meaning: str
-    reason: str
+    std: float  # standard deviation, as a fraction of the scale
+    scale: Scale  # what it is a share of
+    meaning: str  # the quantity
+    reason: str  # why this wide
 
 
 PRIORS: dict[str, Prior] = {

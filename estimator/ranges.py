@@ -15,17 +15,11 @@ __all__ = ["RANGES", "Range", "range_of", "require_in_range"]
 
 
 class Range(NamedTuple):
-    """Range of a number.
+    """Range of a number."""
 
-    Attributes:
-        least: of a number that has to be above 0.
-        most: largest amount.
-        unit: of both; "" for a plain number.
-    """
-
-    least: float
-    most: float
-    unit: str
+    least: float  # of a number that has to be above 0
+    most: float  # largest amount
+    unit: str  # of both; "" for a plain number
 
     def __str__(self) -> str:
         return f"{self.least:g} to {self.most:g} {self.unit}".rstrip()

@@ -60,15 +60,11 @@ class Sample(NamedTuple):
 
 
 class Bits(IntFlag):
-    """Bits of a status: value, meaning, roles.
+    """Bits of a status: value, meaning, roles."""
 
-    Attributes:
-        meaning: in one line, for people.
-        roles: "unusable": no controller may act on an estimate with it; "replayed": it belongs to the sample,
-            so that a replay of samples sets it again.
-    """
-
-    meaning: str
+    meaning: str  # in one line, for people
+    # "unusable": no controller may act on an estimate with it; "replayed": it belongs to the sample, so
+    # that a replay of samples sets it again
     roles: frozenset[str]
 
     def __new__(cls, value: int, meaning: str = "", *roles: str) -> Self:  # noqa: D102
@@ -170,16 +166,12 @@ class External(NamedTuple):
 
 
 class Consistency(NamedTuple):
-    """Flexibility torque from the motor side and from the link's, over the last ten seconds or so.
+    """Flexibility torque from the motor side and from the link's, over the last ten seconds or so."""
 
-    Attributes:
-        difference_rms_nm: rms of their difference; small against the second if the model is right and no
-            unmeasured torque acts on the link.
-        link_flexibility_torque_rms_nm: of the link side's.
-    """
-
+    # rms of their difference; small against the second if the model is right and no unmeasured torque acts
+    # on the link
     difference_rms_nm: float
-    link_flexibility_torque_rms_nm: float
+    link_flexibility_torque_rms_nm: float  # of the link side's
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

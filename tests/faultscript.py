@@ -17,32 +17,21 @@ Step = tuple[float, str, tuple[Any, ...]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
-    """One thing that goes wrong, and what must come of it.
+    """One thing that goes wrong, and what must come of it."""
 
-    Attributes:
-        name: in words.
-        steps: what is done, and when, in seconds from the start.
-        seconds: how long it is watched before everything must be on its way back.
-        flags: each of these is on some estimate.
-        gaps: whether there are cycles without a fresh measurement: none of these is VALID; None: by what the
-            devices happen to read.
-        valid_throughout: whether no estimate may lose VALID.
-        says: regular expressions; each is said exactly once.
-        state: what the status says meanwhile.
-        counts: {(node id, counter): how often in lockstep}; on a real bus at least once.
-        where: "both", "lockstep", "real".
-    """
-
-    name: str
-    steps: tuple[Step, ...]
-    seconds: float = 0.5
-    flags: int = 0
+    name: str  # in words
+    steps: tuple[Step, ...]  # what is done, and when, in seconds from the start
+    seconds: float = 0.5  # how long it is watched before everything must be on its way back
+    flags: int = 0  # each of these is on some estimate
+    # whether there are cycles without a fresh measurement: none of these is VALID; None: by what the
+    # devices happen to read
     gaps: bool | None = False
-    valid_throughout: bool = False
-    says: tuple[str, ...] = ()
-    state: str = ""
+    valid_throughout: bool = False  # whether no estimate may lose VALID
+    says: tuple[str, ...] = ()  # regular expressions; each is said exactly once
+    state: str = ""  # what the status says meanwhile
+    # {(node id, counter): how often in lockstep}; on a real bus at least once
     counts: dict[tuple[int, str], int] = field(default_factory=dict)
-    where: str = "both"
+    where: str = "both"  # "both", "lockstep", "real"
 
 
 def at(seconds: float, action: str, *arguments: Any) -> Step:

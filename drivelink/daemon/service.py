@@ -73,9 +73,6 @@ class Daemon:
         devices: simulated devices in the daemon's thread. They answer immediately, and SYNC advances their
             world; for demonstrations, tests and faster than real time.
 
-    Attributes:
-        loop: the cycle.
-
     Raises:
         DrivelinkError: why it cannot start, in one line.
     """
@@ -120,7 +117,7 @@ class Daemon:
             mine = tuple(known[role.node_id] for role in roles(served.joint, served.folder))
             pipeline = make_pipeline(self._timed(served.joint), mine, keep=keep)
             nodes[LoopJoint(served.joint.name, pipeline, publisher)] = mine
-        self.loop = self._port.loop = CycleLoop(
+        self.loop = self._port.loop = CycleLoop(  # the cycle
             open_source(self._port.bus, self._devices),
             tuple(nodes),
             period_s=section.period_s,

@@ -43,14 +43,10 @@ class RmsErrors(NamedTuple):
 
 
 class Comparison:
-    """Pairs received estimates with the truth.
-
-    Attributes:
-        latest: the last pair, for a view.
-    """
+    """Pairs received estimates with the truth."""
 
     def __init__(self) -> None:
-        self.latest: tuple[EstimateMessage, TruePoint] | None = None
+        self.latest: tuple[EstimateMessage, TruePoint] | None = None  # the last pair, for a view
         self._estimates: dict[int, EstimateMessage] = {}
         self._truth: dict[int, TruePoint] = {}
         self._cycles = self._covered = 0

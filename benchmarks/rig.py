@@ -17,8 +17,6 @@ from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import bench_from_joints
 from drivelink.jointfile import JointFile, parse
 
-__all__ = ["PERIOD_S", "AnsweringBus", "Devices", "free_endpoint", "joint", "joint_text", "subscriber"]
-
 PERIOD_S = 0.001
 VSA = (Path(drivelink.__file__).parent / "joints" / "vsa-ii.toml").read_text(encoding="utf-8")
 NODES = {"1": 1, "2": 2, "10": 3}  # of that file, and those of the first joint here

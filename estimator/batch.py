@@ -31,8 +31,6 @@ from estimator.model import JointModel, ParameterValue, Transmission
 from estimator.sample import SIGMA_95, FloatArray, Record
 from estimator.transmissions import MODELS, RIGID, UNKNOWN, TransmissionModel
 
-__all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "transmission_fits"]
-
 _OF_RIGID = ("coulomb_friction", "torque_offset")
 _NUISANCES = {  # everyday errors by the names of `TransmissionFit.nuisance_std`
     "inertia": "motor_inertia",

@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 from estimator import _core
 
-__all__ = ["CHOICES", "ON_LINE", "Choice", "chance", "choice", "least_rows", "log_odds", "rate", "whole"]
-
 
 class Choice(NamedTuple):
     """A chosen number."""

@@ -15,8 +15,6 @@ from estimator.model import Motor
 from estimator.sample import SIGMA_95, FloatArray, Record
 from estimator.transmissions import transmission_model
 
-__all__ = ["Correlation", "Curve", "correlations", "friction_curve", "stiffness_curve"]
-
 
 class Correlation(NamedTuple):
     """Normalised correlation over lags, and half the 95 % band of none."""

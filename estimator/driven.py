@@ -12,8 +12,6 @@ from estimator.freerun import Bodies
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
-__all__ = ["Path", "driven"]
-
 _PASSES = 3  # over effects with memory in the transmission, each along the link's motion of the one before
 _NEWTON = 10
 _STEP = 1e-6  # rad

@@ -17,22 +17,10 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 
 from estimator import _core
-from estimator._core import STOP_EXPONENT
+from estimator._core import STOP_EXPONENT as STOP_EXPONENT
 from estimator.errors import EstimatorError
 from estimator.model import Effect
 from estimator.sample import FloatArray
-
-__all__ = [
-    "LIBRARY",
-    "STOP_EXPONENT",
-    "Channel",
-    "Coordinates",
-    "EffectType",
-    "Location",
-    "Parameter",
-    "elements",
-    "in_words",
-]
 
 Location = Literal["motor", "transmission", "link", "measurement"]
 Channel = Literal["torque", "motor_torque", "deflection", "link_position"]

@@ -10,8 +10,6 @@ from estimator import _core
 from estimator.model import require_finite
 from estimator.sample import FloatArray
 
-__all__ = ["StateVariableFilter", "smoothed"]
-
 _CUBIC = 3
 
 

@@ -18,17 +18,6 @@ from estimator.errors import EstimatorError
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
 
-__all__ = [
-    "RELATIVE_STEP",
-    "Exponential",
-    "Function",
-    "Linear",
-    "Polynomial",
-    "Table",
-    "TransmissionModel",
-    "VsaII",
-]
-
 RELATIVE_STEP = np.finfo(float).eps ** (1.0 / 3.0)  # of central differences
 
 

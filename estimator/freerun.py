@@ -22,8 +22,6 @@ from estimator.model import Effect, JointModel, Transmission
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import RIGID, TransmissionModel, transmission_model
 
-__all__ = ["Bodies", "FreeRun", "free_run", "nrmse_fit", "simulation_s", "unbroken_s"]
-
 _RESOLVED = 0.1
 _SMOOTHED = 21
 _STEP = 1e-6

@@ -25,9 +25,6 @@ from estimator.sample import ExternalStatus, FloatArray, Record, Status
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import transmission_model
 
-__all__ = ["Unseen", "harm", "harm_of_parts"]
-
-
 _NOTHING = 1e-12  # rad: keeps a channel that stands still finite
 
 

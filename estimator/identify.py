@@ -20,8 +20,6 @@ from estimator.ranges import range_of
 from estimator.sample import Record
 from estimator.transmissions import RIGID
 
-__all__ = ["Identified", "Left", "RecordingFit", "identify"]
-
 _PARAMETER = {
     "encoder_delay": "delay_s",
     "torque_delay": "delay_s",

@@ -17,17 +17,6 @@ from estimator.priors import PRIORS
 from estimator.ranges import range_of, require_in_range
 from estimator.reasons import counted
 
-__all__ = [
-    "HIGHEST_ORDER",
-    "Arrangement",
-    "Effect",
-    "JointModel",
-    "LinkDynamics",
-    "Motor",
-    "ParameterValue",
-    "Transmission",
-]
-
 HIGHEST_ORDER = 9  # of a polynomial in the joint file: what the compiled core has room for
 
 Arrangement = Literal["single", "antagonistic", "serial"]

@@ -19,16 +19,6 @@ from estimator.ranges import require_in_range
 from estimator.sample import Estimate, Record, Sample
 from estimator.settings import EstimatorSettings
 
-__all__ = [
-    "ModelMonitor",
-    "ResidualBaseline",
-    "Second",
-    "can_monitor",
-    "expecting",
-    "measure_baseline",
-    "seconds_of",
-]
-
 _SETTINGS = EstimatorSettings()
 _LEAST_SECONDS = 2  # that a standard deviation takes
 _NOTHING = 1e-12  # N·m: keeps the logarithm of a second without residual or torque finite

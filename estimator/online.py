@@ -16,8 +16,6 @@ from estimator.sample import SIGMA_95, Consistency, Estimate, External, Sample
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import MODELS, RIGID, UNKNOWN, transmission_model
 
-__all__ = ["Estimator", "make_estimator"]
-
 
 class Estimator(Protocol):
     """Interface of both modes."""

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-__all__ = ["PRIORS", "Prior", "Scale"]
-
 Scale = Literal[
     "absolute",  # nothing: in the unit of the quantity
     "declared",  # the declared value itself

@@ -11,8 +11,6 @@ from typing import NamedTuple
 
 from estimator.errors import EstimatorError
 
-__all__ = ["RANGES", "Range", "range_of", "require_in_range"]
-
 
 class Range(NamedTuple):
     """Range of a number."""

@@ -10,8 +10,6 @@ from estimator.sample import Status
 if TYPE_CHECKING:
     from estimator.online import Estimator
 
-__all__ = ["CHANGES", "REASONS", "percent", "reason_text", "why_not_valid"]
-
 _SERVICE = (
     (Status.STALE, "stale"),
     (Status.CONTRADICTED, "contradicted"),

@@ -19,20 +19,6 @@ from numpy.typing import NDArray
 from estimator.errors import EstimatorError
 from estimator.ranges import require_in_range
 
-__all__ = [
-    "SIGMA_95",
-    "Bits",
-    "Consistency",
-    "Estimate",
-    "External",
-    "ExternalStatus",
-    "FloatArray",
-    "Record",
-    "Sample",
-    "Status",
-    "TransmissionEstimate",
-]
-
 FloatArray = NDArray[np.float64]
 SIGMA_95 = 1.959963984540054  # half a 95 % interval of a normal distribution, in standard deviations
 

@@ -7,8 +7,6 @@ from typing import Any, ClassVar, Literal
 
 from estimator.model import require, require_declared
 
-__all__ = ["EstimatorSettings"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EstimatorSettings:

@@ -16,20 +16,10 @@ from estimator.flexibility import (
     Linear,
     Polynomial,
     Table,
-    TransmissionModel,
     VsaII,
 )
+from estimator.flexibility import TransmissionModel as TransmissionModel
 from estimator.model import Transmission
-
-__all__ = [
-    "MODELS",
-    "RIGID",
-    "UNKNOWN",
-    "TransmissionModel",
-    "register",
-    "register_table",
-    "transmission_model",
-]
 
 RIGID = "none"  # no deflection: the torque is the residual of the motor's balance
 UNKNOWN = "unknown"  # flexible, but no model of it: black-box estimation

@@ -14,8 +14,6 @@ joints (`estimators.py --mixed`) run with it: the share of time without a usable
 which is wrong, and the share of 95 % intervals that do not hold.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -13,8 +13,6 @@ In lockstep world, devices, frames, cycles and puts of one or several joints tak
 goes. The baseline of the start is Python with the libraries that any such program imports.
 """
 
-from __future__ import annotations
-
 import math
 import signal
 import statistics

@@ -8,8 +8,6 @@ with the estimator. Listed: named first, or an alternative with a probability of
 certain: a name that the joint does not carry, with a probability above 0.9.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -7,8 +7,6 @@ are over all ticks after the first three seconds. Fits (the best of three) and d
 quadratic joint, the latter with friction that the model lacks: CPU time of one thread.
 """
 
-from __future__ import annotations
-
 import gc
 import time
 from collections.abc import Callable, Iterator

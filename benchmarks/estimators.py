@@ -16,8 +16,6 @@ either. With --mixed a spring, its declaration, an effect and a motion are drawn
 to the hopeless; wrong is what is off by more than a tenth and by more than three standard deviations.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import Counter

@@ -22,8 +22,6 @@ is valid. delay: median over pushes of half of gravity and more. alarms: contact
 share of the free motion in which the torque is valid.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import statistics

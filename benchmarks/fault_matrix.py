@@ -14,8 +14,6 @@ With --sizes instead: for each kind of fault the largest size up to which nothin
 seconds (every sample valid, no flag), and by how much the stiffness is off then.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 

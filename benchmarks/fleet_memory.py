@@ -5,8 +5,6 @@
 The rise over that of the file's size is what `drivelink/fleet/task.py` plans with.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

@@ -8,8 +8,6 @@ seed of its own, counted up from the one given. With --parsers: damaged inputs f
 (`tests/fuzzparsers.py`), with CPU and memory of the costliest; what fails is kept in `tests/corpus`.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import logging

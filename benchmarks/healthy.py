@@ -8,8 +8,6 @@ inertia up to 5 % off. The second recording has a motion of its own, in kind, si
 moves or pushes the link, no link dynamics are declared.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

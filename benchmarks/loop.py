@@ -8,8 +8,6 @@ file's own test watches ten more seconds. The finding comes 15 s after the alarm
 diagnosis on a free processor. `drivelink demo --case …` does the same in three processes in real time.
 """
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Sequence

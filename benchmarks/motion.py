@@ -12,8 +12,6 @@ truth is among those that the motion is designed for. Damping of the transmissio
 [link.dynamics] no motion tells it from a late sensor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -9,8 +9,6 @@ Units of the table are the paper's (N·mm); inside everything is SI. Ten times t
 is used, the printed one is listed too: its 10 N·mm reaches |phi| = 0.07 rad, its polynomial fits 0.45 rad.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple

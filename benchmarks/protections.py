@@ -7,8 +7,6 @@ Each change is made in a copy of the checkout, where the tests named beside it r
 without it is reported, and the exit status is 1.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

@@ -8,8 +8,6 @@ their motor files of github.com/aksel-ilveskero/Shaftline-Torque-Estimation, if 
 torque sensor.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

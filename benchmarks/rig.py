@@ -1,7 +1,5 @@
 """What the benchmarks of the service share: the joint, its simulated devices, a subscriber."""
 
-from __future__ import annotations
-
 import re
 import socket
 import subprocess

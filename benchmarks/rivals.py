@@ -1,7 +1,5 @@
 """What `drivelink run` is measured against: the textbook way, and the floor."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

@@ -7,8 +7,6 @@ the other sections of an earlier run are kept, each with the time and the load o
 A section whose data or tool is not there is left out, and the results say so.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import platform

@@ -4,8 +4,6 @@ A column is a header and a template over the row: `{"RMSE %": "{rmse:.2%}"}`. Wh
 shown as a dash. Rows are dictionaries, written as they are by `--json FILE`.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -19,8 +19,6 @@ Episodes are written to stderr as they come, and how far it is once a minute. Ct
 `timeout 300 python benchmarks/soak.py …` end it after the fault that is on, with its report.
 """
 
-from __future__ import annotations
-
 import argparse
 import ctypes
 import gc

@@ -1,7 +1,5 @@
 """Joints of `world.c`, the independent simulator: compile it, run it, read what it writes."""
 
-from __future__ import annotations
-
 import functools
 import subprocess
 import tempfile

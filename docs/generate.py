@@ -5,8 +5,6 @@ Keys, effects, layouts and commands stand in the pages between `<!-- from the co
 page has a link to the package, alone in a line, with the title "from the code".
 """
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import inspect

@@ -4,8 +4,6 @@ Browsers render MathML themselves, so formulas need no script; long ones are cut
 diagram inside the page takes the page's colours, in light and dark mode.
 """
 
-from __future__ import annotations
-
 import html
 import importlib.util
 import re

@@ -3,8 +3,6 @@
 Run `python docs/notebook.py` after a change of the notebook or of what it calls. A test executes it, too.
 """
 
-from __future__ import annotations
-
 import ast
 import base64
 import contextlib

@@ -3,8 +3,6 @@
 Takes some minutes and needs Chromium. `--only demo web` draws some of them.
 """
 
-from __future__ import annotations
-
 import argparse
 import fcntl
 import io

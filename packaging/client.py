@@ -7,8 +7,6 @@ core defines, are written as a module `drivelink/_core.py`: the wheel runs on ev
 and zenoh only.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tomllib

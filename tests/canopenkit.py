@@ -3,8 +3,6 @@
 It shares no code with `sim` or `drivelink`: what both believe is checked against a third opinion.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """A headless Chromium spoken to by its DevTools pipe: just enough to open a page, ask it, and photograph it."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

@@ -1,7 +1,5 @@
 """Joints with the effects that a diagnosis names: many at once, by the integrator of `joints`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import joints

@@ -5,8 +5,6 @@ a function of the signal's values from its begin on. Signals are motor position,
 joint with two motors it is the first one's.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ What must follow is part of it: what the estimates' flags say, what is said in t
 everything is well again without a restart. The actions are methods of `faultstage.Stage`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

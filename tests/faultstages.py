@@ -1,7 +1,5 @@
 """The two stages of the fault script: all in one thread on the virtual bus, and in real time on any bus."""
 
-from __future__ import annotations
-
 import subprocess
 import threading
 import time

@@ -1,7 +1,5 @@
 """What the devices of a world measured, and whether a sample is that."""
 
-from __future__ import annotations
-
 from drivelink.canopen.layout import MappedObject, Signal
 from drivelink.daemon.service import Daemon
 from estimator.sample import Sample

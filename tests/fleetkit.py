@@ -1,7 +1,5 @@
 """A few small recordings of small joints, for the tests of the fleet."""
 
-from __future__ import annotations
-
 import functools
 import threading
 from collections.abc import Iterator

@@ -12,8 +12,6 @@ right in identifier and length and comes first in its cycle. Those are counted, 
 must be no exception, and an end.
 """
 
-from __future__ import annotations
-
 import random
 import struct
 from collections import Counter, deque

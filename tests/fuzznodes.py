@@ -1,7 +1,5 @@
 """The slaves on the bus that lies: each value identifies the SYNC it was sampled at, and one of them is a trap."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from simkit import StubRig

@@ -1,7 +1,5 @@
 """Every parser of what others write: good inputs, damage to them, and what may come of it: a result or one line."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import random

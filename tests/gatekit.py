@@ -4,8 +4,6 @@ A joint is drawn from a seed: its bodies, spring, gear, sensors, a rig of some g
 and other effects that nobody declares, late encoders, and a declared inertia that is up to a fifth off.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

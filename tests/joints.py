@@ -4,8 +4,6 @@ The classical fourth-order step, fixed, with the torque held over each period as
 arrays carry the joint as their first axis, so a hundred random joints cost what one does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path

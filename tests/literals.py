@@ -5,8 +5,6 @@ A choice that might be another number belongs into a table (`estimator.choices`,
 afterwards, or of rounding.
 """
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

@@ -3,8 +3,6 @@
 Everything goes through the public interface, `make_estimator(...).step`, so it holds for whatever is behind.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace

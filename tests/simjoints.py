@@ -1,7 +1,5 @@
 """Joints that several tests of the world use."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

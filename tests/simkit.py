@@ -1,7 +1,5 @@
 """What the tests of the simulated devices share: a rig of known values, a wire, annotated transcripts."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager

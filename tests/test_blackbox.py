@@ -1,7 +1,5 @@
 """The black box: what led to an event becomes a recording, without the daemon's help."""
 
-from __future__ import annotations
-
 import gc
 import json
 import math

@@ -1,7 +1,5 @@
 """PDO mappings: frame by frame, of drives with maps of their own, and of drives that answer in their own way."""
 
-from __future__ import annotations
-
 import errno
 from collections import Counter
 from dataclasses import dataclass

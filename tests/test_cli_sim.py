@@ -1,7 +1,5 @@
 """`drivelink sim` as a process."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What every verb has in common: pure JSON where it is asked for, errors in a line, its own usage, the bus by option."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

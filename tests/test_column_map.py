@@ -1,7 +1,5 @@
 """`--map`: columns of others under our names and in our units; and results for machines, pure."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

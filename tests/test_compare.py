@@ -1,7 +1,5 @@
 """`drivelink compare`, and fit, prediction, diagnosis and the free run in Python: what tells models apart is told."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """A passive daemon beside a master that maps, stops, resets and starts the nodes: no sample by a wrong map."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 

@@ -1,7 +1,5 @@
 """A bus on which somebody else makes SYNC: it is numbered, its period is measured, said, and used."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import random

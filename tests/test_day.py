@@ -1,7 +1,5 @@
 """The last 24 hours: rows of the black box, events with their recordings and diagnoses, in the web view."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Delays that a drive or a bus has are fitted and found; longer ones are errors of the time stamps."""
 
-from __future__ import annotations
-
 import diagnosiskit as kit
 import joints
 import numpy as np

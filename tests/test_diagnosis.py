@@ -1,7 +1,5 @@
 """Injected effects are named, located and measured; clean recordings raise no alarm; faults are one line."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

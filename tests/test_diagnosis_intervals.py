@@ -1,7 +1,5 @@
 """Intervals of a diagnosis hold where errors are no noise; how sure the inertia is can be declared."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import diagnosiskit as kit

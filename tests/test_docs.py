@@ -1,7 +1,5 @@
 """The documentation says what the code does: generated pages are current, links and examples lead somewhere."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import dataclasses

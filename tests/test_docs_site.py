@@ -1,7 +1,5 @@
 """The built documentation: strict, complete, and nothing in it is loaded from another host."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import subprocess

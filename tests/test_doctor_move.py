@@ -1,7 +1,5 @@
 """`doctor --move`: a person turns the joint, and every wrong sign and scale ends in the line that cures it."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """The library of effects, filters over whole recordings, and declared effects that are part of a transmission's curve."""
 
-from __future__ import annotations
-
 import math
 
 import joints

@@ -1,7 +1,5 @@
 """What a diagnosis says, and of what it does not: healthy recordings, shares of certainty, one-way motions."""
 
-from __future__ import annotations
-
 import io
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Several recordings of one joint, and joints with one encoder: what `fit` finds of machine, runs and load."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """What `fit` prints, what fit.json says, and what `--write` writes are the same numbers."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """`drivelink fleet`: every recording once, whatever breaks; what the table holds is what fit and diagnose say."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

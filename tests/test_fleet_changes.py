@@ -1,7 +1,5 @@
 """Change points of a fleet: what is there is found, at the declared rate of false ones; what is odd is not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import false_discovery_control

@@ -1,7 +1,5 @@
 """A run over a fleet: whatever is killed, nothing is lost or doubled, and nobody else gets in."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """The table of a fleet: rows of runs at once and after each other, and what the page makes of them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from datetime import UTC, datetime, timedelta

@@ -1,7 +1,5 @@
 """`drivelink monitor --foxglove`: a WebSocket client gets described channels, and a joint's estimates live."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import struct

@@ -3,8 +3,6 @@
 The tolerance of a factor found is 5 %: what is not a unit or a declared gear ratio is read off the motion.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

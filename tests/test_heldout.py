@@ -1,7 +1,5 @@
 """What data that took no part in a fit say about its intervals: ratios of errors that are known in closed form."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The loop: a recording is diagnosed, its finding published, accepted by a person, and the residual watched."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -1,7 +1,5 @@
 """What is installed: one compiled core of the same version, every file that is read, and locked versions."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

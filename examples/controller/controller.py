@@ -8,8 +8,6 @@ springs in the place of K^-1 g(q):
     tau_e,1(phi*_1) + tau_e,2(phi*_2) = -g(q),    sigma_1(phi*_1) + sigma_2(phi*_2) = sigma_d
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress

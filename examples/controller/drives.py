@@ -4,8 +4,6 @@ The daemon owns the bus (NMT, SYNC, TPDOs). From here come RPDO3 of each drive w
 torque limit, and a heartbeat by which a drive notices that this process is gone (0x1016, 0x6007).
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import sys

@@ -8,8 +8,6 @@ It prints each change of phase, and once a second where the joint is and where i
 change of phase as one line of JSON. Ctrl-C takes the torque away and ends it.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging

@@ -1,7 +1,5 @@
 """Compares two models, two recordings, or a model with a machine: `drivelink compare A B`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

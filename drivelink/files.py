@@ -8,8 +8,6 @@ For all verbs: a named file (`--out FILE`, `--write`, `new PATH`) is replaced on
 never. Files of a results folder (`--out DIR`, `--plots DIR`) are replaced by each run.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

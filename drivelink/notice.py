@@ -1,7 +1,5 @@
 """A finding about a machine, a bus or a drive: its severity, and the command that fixes it."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import asdict, dataclass, field
 from enum import IntEnum

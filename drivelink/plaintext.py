@@ -1,7 +1,5 @@
 """Words of drives, files and messages as plain text: what a terminal or a browser would obey is left out."""
 
-from __future__ import annotations
-
 import codecs
 import difflib
 import html

@@ -1,7 +1,5 @@
 """Recordings of one joint as a user names them, read and checked: what `fit` and `diagnose` begin with."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

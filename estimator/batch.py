@@ -5,8 +5,6 @@ with the errors that every rig has, within the priors of `estimator.priors`. Opt
 readings, friction of a rigid joint) are kept only if the data support them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ Those that the on-line estimator makes too are written in `estimator/core/src/ch
 `estimator.priors`. `python benchmarks/constants.py` halves and doubles each entry of all three.
 """
 
-from __future__ import annotations
-
 import math
 from statistics import NormalDist
 from typing import NamedTuple

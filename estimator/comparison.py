@@ -1,7 +1,5 @@
 """What tells two models apart: correlations of a free run's residual, curves with intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple

@@ -8,8 +8,6 @@ times its linear parameter. A measured torque is the acting torque plus x; a rea
 its error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, cast

@@ -1,7 +1,5 @@
 """The filter of the balance over whole recordings; `estimator/core/src/filters.rs` has its discretisation."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ Every model is odd in phi (eq 2) and gives torque, stiffness sigma = df/dphi (eq
 df/dalpha (eq 25). The laws are those of `estimator._core`, which the on-line estimator uses as well.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

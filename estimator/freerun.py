@@ -4,8 +4,6 @@ The torque is held over each period, as a drive holds it. Windows of the recordi
 starts from the measured state, for a joint without position control drifts in any long free run.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

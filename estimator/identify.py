@@ -1,7 +1,5 @@
 """Identifies a joint's model from healthy recordings, for `drivelink fit`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -3,8 +3,6 @@
 Frozen dataclasses, validated at construction; they know no file format.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

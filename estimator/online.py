@@ -1,7 +1,5 @@
 """Makes estimators that run tick by tick, and the protocol that they implement."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Protocol
 

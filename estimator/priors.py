@@ -4,8 +4,6 @@ Every number is a standard deviation relative to a scale given by the joint file
 table applies to joints of any size.
 """
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 Scale = Literal[

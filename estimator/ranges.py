@@ -4,8 +4,6 @@ They are far beyond any machine, and narrow enough that no number in them overfl
 to prepare, or makes it large.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Registry of transmission models by their names in the joint file."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

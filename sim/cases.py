@@ -15,8 +15,6 @@ are 1e-3 of theirs, so that all numbers go over by the same factor.
 Drives, gears and encoders are assumed in every case: the paper states none. Reasons stand beside the values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -10,8 +10,6 @@ serial arrangement motor 1 carries the link through a spring whose lever motor 2
 tau_e = tau_e,1 = rho² F'(phi_1) and motor 2 feels tau_e,2 = -dU_e/dtheta_2 = -2 l rho F(phi_1).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The simulated world's exceptions: one root, raised when a world is built, never while it runs."""
 
-from __future__ import annotations
-
 import math
 from numbers import Real
 

@@ -5,8 +5,6 @@ All torques are at the joint. A profile is a function of time; a soft spring (`c
 away. Both are sampled once per control period and held.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable, Mapping

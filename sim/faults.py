@@ -1,7 +1,5 @@
 """Injects faults of devices and wires, at once or at a given SYNC."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from sim.canopen.drive import Cia402Drive

@@ -6,8 +6,6 @@ Moreau's time stepping). Terms with memory (hysteresis, presliding) are evaluate
 once per step.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -5,8 +5,6 @@ period, so results do not depend on the machine. Served by a thread (`start`), t
 clock in whole periods locked to the SYNC, as a drive's control loop does. `Bench` is what stands on one bus.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -5,8 +5,6 @@ estimator's. Every law is odd, has a potential (eq 1) and is made of scalar clos
 it four times per step.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ A drive works at the motor shaft: joint position times gear ratio, joint torque 
 its current times its torque constant, so a reported torque is never better than the reported current.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

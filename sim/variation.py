@@ -1,7 +1,5 @@
 """Plants with changed parameters, and a suitable excitation for them."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ whose current loop is updated at the SYNC: it latches the last set-point at SYNC
 and holds it until SYNC k+1.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ A failure is one line. SocketCAN gets a receive buffer sized for the bus, kernel
 CAN FD frames, and a check of the interface's state.
 """
 
-from __future__ import annotations
-
 import contextlib
 import difflib
 import errno

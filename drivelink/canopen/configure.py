@@ -5,8 +5,6 @@ again: the loop passes every SDO response to `feed`, calls `poll` regularly, and
 Nothing here waits or reads the bus.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -5,8 +5,6 @@ types. Each is a line in `DataSheet.problems`, not an error. The objects are can
 none of that, and takes 50 µs for each.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path

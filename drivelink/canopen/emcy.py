@@ -1,7 +1,5 @@
 """EMCY messages, NMT states and statuswords in words (CiA 301, 7.2.7, 7.2.8; CiA 402-2, 8.4)."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

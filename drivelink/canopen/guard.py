@@ -5,8 +5,6 @@ downloads to communication objects (0x1005 to 0x1019, 0x1800 to 0x1BFF of CiA 30
 else, such as controlword, modes of operation and targets.
 """
 
-from __future__ import annotations
-
 import can
 
 from drivelink._core import SYNC_COB_ID

@@ -5,8 +5,6 @@ with n data bytes takes at most 47 + 8 n + ⌊(33 + 8 n) / 4⌋ bits, interframe
 included: 55 for a SYNC, 135 for eight bytes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum

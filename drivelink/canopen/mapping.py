@@ -5,8 +5,6 @@ The order is the one that all drives accept: pre-operational; 0x1800:01 invalid 
 written to and stays operational, also after a restart of the daemon.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NoReturn

@@ -1,7 +1,5 @@
 """Text of a commented joint file, from a few answers or from the nodes on the bus."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from drivelink.canopen.scan import FoundNode

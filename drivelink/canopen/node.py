@@ -1,7 +1,5 @@
 """Configures one node: identity, units, mapping, SYNC, heartbeat."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 This module cannot send. Only traffic and joint file are trusted, the traffic first; see `PassiveNode`.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is known of a node that another master configures: mapping, units, and whether to trust them."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable
 from dataclasses import replace
 from functools import partial

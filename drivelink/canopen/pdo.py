@@ -5,8 +5,6 @@ a second one. Fixed mappings that carry the needed signals are used as they are.
 `drivelink.canopen.sdo`, because canopen's PDO code blocks until each answer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

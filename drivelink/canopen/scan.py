@@ -4,8 +4,6 @@ Every node id is asked for its device type (0x1000, mandatory in CiA 301), all a
 send heartbeat or boot-up, are found.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress

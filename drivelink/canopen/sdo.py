@@ -6,8 +6,6 @@ program serves the configuration before the start and that of a drive that reboo
 thread or reader of the bus; canopen's client blocks its caller until the answer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Generic, TypeVar

@@ -5,8 +5,6 @@ The joint file has priority; missing values are taken from the drive (0x608F, 0x
 numbers and the one in use.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """`drivelink accept JOINT`: what the newest finding proposes, shown, asked for, written, and watched."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

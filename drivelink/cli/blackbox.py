@@ -1,7 +1,5 @@
 """The process of a joint's black box, beside its daemon: `python -m drivelink.cli.blackbox JOINT`."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

@@ -1,7 +1,5 @@
 """`drivelink compare A B`: two models, two recordings, or a model beside a machine."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`drivelink completion SHELL`: what a shell needs to complete verbs, options and files."""
 
-from __future__ import annotations
-
 import argparse
 
 import shtab

@@ -1,7 +1,5 @@
 """`drivelink dbc JOINT`: the joint's frames as a DBC database for other CAN tools."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

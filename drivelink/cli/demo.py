@@ -1,7 +1,5 @@
 """`drivelink demo`: everything without hardware, watched from a process of its own."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging

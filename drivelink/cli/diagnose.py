@@ -1,7 +1,5 @@
 """`drivelink diagnose RECORDING --joint JOINT`: residual, missing effect, better model, its error."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`drivelink doctor`."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import select

@@ -1,7 +1,5 @@
 """`drivelink fit RECORDING… --joint JOINT`: model-based estimation from recordings."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

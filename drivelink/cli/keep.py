@@ -1,7 +1,5 @@
 """`drivelink keep JOINT`: the black box of a running daemon keeps the last minute."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

@@ -1,7 +1,5 @@
 """`drivelink list`: the joints whose daemons are alive."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

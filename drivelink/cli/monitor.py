@@ -1,7 +1,5 @@
 """`drivelink monitor [JOINT]`: what daemons publish, live in the terminal or in a browser."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import signal

@@ -1,7 +1,5 @@
 """`drivelink new`."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

@@ -1,7 +1,5 @@
 """`drivelink record JOINT --out FILE`: records a running daemon and the bus."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

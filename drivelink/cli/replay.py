@@ -1,7 +1,5 @@
 """`drivelink replay FILE --joint JOINT`: a recording through the same code as live data."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

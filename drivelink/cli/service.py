@@ -1,7 +1,5 @@
 """`drivelink service install JOINT` and `uninstall`: the daemon of a joint as a systemd service."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

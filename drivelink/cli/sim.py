@@ -1,7 +1,5 @@
 """`drivelink sim JOINT…`: the simulated drives alone, on the bus of the joint file."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -5,8 +5,6 @@ frames are not used. A mapping that is known again applies from a SYNC on: anoth
 the first that the node answers with it; the daemon's own from the first after the start of the node.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -3,8 +3,6 @@
 A task that is too long for one cycle is a generator: each `yield` leaves the rest to the next slack.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator
 
 Task = Callable[[], object]

@@ -4,8 +4,6 @@ A cycle is `tick` and `receive`. `drivelink.cycle.realtime` calls them by the cl
 master; `run_lockstep` without a clock.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import deque

@@ -7,8 +7,6 @@ An answer during the configuration may have been somebody else's, a tool may wri
 of the right length may carry another object than its map says.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence

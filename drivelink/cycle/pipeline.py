@@ -1,7 +1,5 @@
 """Makes a joint's pipeline (`drivelink._core.JointPipeline`) from its joint file: live, lockstep, replay."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

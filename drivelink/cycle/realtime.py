@@ -6,8 +6,6 @@ is too late is skipped and counted, and is a gap to the estimators. Housekeeping
 cycle's work and the next SYNC.
 """
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

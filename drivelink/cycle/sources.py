@@ -4,8 +4,6 @@ python-can makes a Message of every frame, which costs more than the whole cycle
 SocketCAN is read directly (with the kernel's stamps); other interfaces through `recv`.
 """
 
-from __future__ import annotations
-
 import errno
 import select
 import socket

@@ -1,7 +1,5 @@
 """Starts on a bus: configure the nodes or listen to their configuration, then wait for their frames."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

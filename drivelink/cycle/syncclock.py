@@ -1,7 +1,5 @@
 """Converts stamps of SYNC to whole periods between them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Keeps the bus open; watches SYNC, the CAN controller and this machine's speed; reports each event once."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

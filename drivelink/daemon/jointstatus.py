@@ -1,7 +1,5 @@
 """Makes the document of the status key: one joint, a few times a second."""
 
-from __future__ import annotations
-
 import math
 import os
 import time

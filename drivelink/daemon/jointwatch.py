@@ -1,7 +1,5 @@
 """Watches a joint and its nodes: estimates, cross-checks, frames, heartbeats, faults; each event once."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable

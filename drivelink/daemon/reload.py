@@ -7,8 +7,6 @@ If the thread cannot catch up with the cycle, the cycle does the rest with more 
 new samples, so the exchange always completes.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -4,8 +4,6 @@ A node that rebooted, fell silent or left the operational state is configured ag
 stepwise in the slack. A passive daemon only observes. Every event is reported once.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from dataclasses import replace

@@ -4,8 +4,6 @@ Three processes: the simulated joint with its daemon, the black box with its dia
 watches and, asked or with `--yes`, accepts.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping

@@ -5,8 +5,6 @@ other's hold on the interpreter, which no real drive does; for the same reason t
 process. The truth goes to it through a pipe, with the sequence numbers of the estimates.
 """
 
-from __future__ import annotations
-
 import logging
 import signal
 from collections.abc import Mapping

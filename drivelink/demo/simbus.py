@@ -5,8 +5,6 @@ process: `SocketcandServer` is itself a python-can bus. Raw mode only, no CAN FD
 https://github.com/linux-can/socketcand/blob/master/doc/protocol.md.
 """
 
-from __future__ import annotations
-
 import errno
 import selectors
 import socket

@@ -5,8 +5,6 @@ plus `sim.effect`. Drives and encoders follow the `drive` and `encoder` sections
 same joint file finds what it expects.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Follows the rig's process: truth beside estimate, on a terminal or in plain lines."""
 
-from __future__ import annotations
-
 import math
 import multiprocessing
 import sys

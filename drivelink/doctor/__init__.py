@@ -1,7 +1,5 @@
 """Finds problems of machine, bus and drives, and the fix for each. Changes nothing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from drivelink.doctor.datasheet import examine_sheet

@@ -1,7 +1,5 @@
 """Examines an EDS or DCF: signals that the drive can send, the mapping that would be used, cross-checks."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

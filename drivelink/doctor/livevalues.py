@@ -1,7 +1,5 @@
 """A joint's channels as they are now: asked by SDO, or heard in the frames of a bus that may not be asked."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Checks this machine (scheduling, memory, CPU clock, timer), its CAN interface, SYNC on its bus, zenoh."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

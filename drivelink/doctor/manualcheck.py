@@ -4,8 +4,6 @@ drivelink never moves a drive: a person turns or jogs the joint and enters the a
 with it, torques with the reaction of a holding drive to a push.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -3,8 +3,6 @@
 The drives are only read; move the joint meanwhile, by hand or by its controller.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

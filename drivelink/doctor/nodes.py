@@ -1,7 +1,5 @@
 """Checks the bus: nodes, their identity and TPDOs, SYNC and its jitter."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

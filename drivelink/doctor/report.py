@@ -1,7 +1,5 @@
 """The doctor's findings, as data and in the terminal."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 The only module of the fleet that calls the estimator.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

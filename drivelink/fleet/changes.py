@@ -19,8 +19,6 @@ Fleet. Benjamini and Hochberg (1995) over all series of all joints. Further chan
 selected are looked for one after the other at the level of the selection (Benjamini and Bogomolov 2014).
 """
 
-from __future__ import annotations
-
 import json
 import math
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """The fleet's report as one self-contained page."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 Credentials and endpoints are those of fsspec (configuration files, `FSSPEC_…` and `AWS_…` variables).
 """
 
-from __future__ import annotations
-
 import hashlib
 import tempfile
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Summarises each joint from the table: trend, changes, new effects, urgency."""
 
-from __future__ import annotations
-
 from collections import Counter
 from datetime import UTC, datetime
 from itertools import groupby

@@ -4,8 +4,6 @@ A run writes parts of its own, each replaced as a whole while it grows, so that 
 incomplete one. At its end it merges small parts and leaves out rows that newer ones replace.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import io

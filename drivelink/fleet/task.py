@@ -1,7 +1,5 @@
 """The task on a worker: one recording, in parts that fit into its memory, to rows of the table."""
 
-from __future__ import annotations
-
 import csv
 import logging
 import math

@@ -1,7 +1,5 @@
 """Stiffness and other parameters of a joint over its recordings: what changes, and what the change is of."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter

@@ -1,7 +1,5 @@
 """Joint files: schema, hints for unknown keys, new files, changes by fit and diagnose."""
 
-from __future__ import annotations
-
 from drivelink.jointfile.document import MAX_BYTES as MAX_BYTES
 from drivelink.jointfile.document import JointText as JointText
 from drivelink.jointfile.document import changes_to as changes_to

@@ -1,7 +1,5 @@
 """Reads a joint file in a process of its own, so that no file takes the interpreter from the cycle."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

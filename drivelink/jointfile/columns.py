@@ -1,7 +1,5 @@
 """Names of the columns of a recording, and the units that columns of others may have."""
 
-from __future__ import annotations
-
 import math
 
 _REVOLUTION = 2.0 * math.pi

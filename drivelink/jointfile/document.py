@@ -1,7 +1,5 @@
 """Reads, validates and rewrites joint files. An error is one line: file, key, what was expected."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -3,8 +3,6 @@
 Nothing here is done by itself: a person asks for it, by `drivelink accept` or in the web view.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The black box: the last minute of a joint in bounded memory; what led to an event becomes a recording."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import logging

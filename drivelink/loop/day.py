@@ -1,7 +1,5 @@
 """The last day of a joint: stiffness and friction, a row a second, in two files of bounded size."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

@@ -1,7 +1,5 @@
 """Diagnoses a kept recording at idle priority: `python -m drivelink.loop.diagnosing RECORDING`."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

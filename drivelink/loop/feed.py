@@ -1,7 +1,5 @@
 """What the daemon does for the loop, in threads: its state for the black box, the newest finding."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """A black box's folder: recordings, beside each its finding (a JSON document) and the proposed joint file."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

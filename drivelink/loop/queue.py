@@ -1,7 +1,5 @@
 """The queue of diagnoses: one recording of the folder at a time, each in a process of its own."""
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Plots in text: curves of braille dots (2 by 4 in a character) and sparklines."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 Fed with every estimate (a few microseconds each), read a few times a second.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence

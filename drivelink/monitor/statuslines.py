@@ -4,8 +4,6 @@
 document. Terminal, web page and plain lines use its result.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

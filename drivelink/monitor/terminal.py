@@ -1,7 +1,5 @@
 """The terminal of a view: several joints, one line each; single keys without Enter."""
 
-from __future__ import annotations
-
 import math
 import os
 import select

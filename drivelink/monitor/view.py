@@ -8,8 +8,6 @@ with rich.live.Live(view, auto_refresh=False) as live:
 print(view.line())                           # the same in one plain line, where there is no terminal
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

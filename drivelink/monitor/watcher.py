@@ -4,8 +4,6 @@ Each joint follows one daemon, as a controller's subscription does. Everything p
 `drivelink.pubsub.feed`, so no network input ends a view or fills its memory.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from typing import Any

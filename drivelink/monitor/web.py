@@ -4,8 +4,6 @@ Nothing is loaded from other hosts, the server listens on loopback only, and req
 the user's browser (a foreign Host or Origin header) are refused. Of too many streams the oldest ends.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

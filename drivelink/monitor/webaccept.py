@@ -4,8 +4,6 @@ Only the page itself can ask for it: it carries a token that no other site can r
 site may send without being refused first; and it names the recording whose proposal it has shown.
 """
 
-from __future__ import annotations
-
 import hmac
 import secrets
 import time

@@ -1,7 +1,5 @@
 """The last 24 hours in the web view: rows of the black box, its events, and the files that they link to."""
 
-from __future__ import annotations
-
 import json
 import mimetypes
 from importlib.resources import files

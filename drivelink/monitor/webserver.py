@@ -1,7 +1,5 @@
 """An HTTP server with a limit on its connections."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from contextlib import suppress

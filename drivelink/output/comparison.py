@@ -1,7 +1,5 @@
 """Two models beside each other, and beside the machine: free runs, correlations of the residual, curves."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Mapping, Sequence

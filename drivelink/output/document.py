@@ -1,7 +1,5 @@
 """What a verb reports: sections of texts, tables and charts, drawn as a page or printed in a terminal."""
 
-from __future__ import annotations
-
 import html as markup
 import io
 import json

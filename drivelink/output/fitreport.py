@@ -1,7 +1,5 @@
 """What `drivelink fit` reports: tables of the fitted numbers, and a plot of each transmission."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 

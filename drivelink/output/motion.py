@@ -1,7 +1,5 @@
 """The motion to record next: a CSV file for the controller, a picture, the odds it is expected to give."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Numbers as people read them: digits that follow the uncertainty, units, effects with their parameters."""
 
-from __future__ import annotations
-
 import math
 
 from estimator.model import ParameterValue

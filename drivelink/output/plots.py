@@ -8,8 +8,6 @@ Figures are made without pyplot: no global state, no window, safe in any thread.
     save(figure, Path("joint.png"))
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping
 from pathlib import Path

@@ -3,8 +3,6 @@
 It writes to stderr, shows nothing for work that is done at once, and costs well under a microsecond an item.
 """
 
-from __future__ import annotations
-
 import time
 from typing import Self
 

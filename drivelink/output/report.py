@@ -1,7 +1,5 @@
 """Writes the report of a diagnosis: report.json for programs, report.html for people."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial

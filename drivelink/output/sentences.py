@@ -1,7 +1,5 @@
 """Says in sentences what a diagnosis found."""
 
-from __future__ import annotations
-
 from drivelink.output.numbers import Units, number
 from estimator.diagnosis import Curve, Diagnosis, Finding, advice_for
 from estimator.effects import in_words

@@ -13,8 +13,6 @@
 What happens to the daemon is `state`, never an exception.
 """
 
-from __future__ import annotations
-
 import asyncio
 import atexit
 import math

@@ -3,8 +3,6 @@
 Estimates queue in zenoh, outside the interpreter, until a method is called.
 """
 
-from __future__ import annotations
-
 import difflib
 import logging
 import math

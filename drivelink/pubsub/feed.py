@@ -11,8 +11,6 @@ stale. A session can forge its identity. What stops that is TLS and access contr
 docs/how-to/secure-zenoh.md.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -7,8 +7,6 @@ microcontroller. `drivelink/core/src/wire.rs` defines the fields: structs, the `
 documentation are made from them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 `read` reads any of them. Irregularities are one-line warnings of the logger `drivelink.recording`.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from drivelink.errors import RecordingError, UsageError

@@ -4,8 +4,6 @@ Unlike python-can's reader it is several times as fast, its stamps are exact, an
 or without an end costs no more than its bytes. The layout is the one that python-can's reader knows.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 import zlib

@@ -4,8 +4,6 @@ The frames go through the assembler of live frames. Their mapping is known from 
 configuration in the recording.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import deque
 from collections.abc import Iterator, Sequence

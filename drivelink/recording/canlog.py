@@ -3,8 +3,6 @@
 Yields data frames with 11-bit identifiers as tuples, in file order.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from binascii import unhexlify

@@ -3,8 +3,6 @@
 Columns of others become ours, in SI: `--map q=link_position_rad:deg`, or `[recording.columns]`.
 """
 
-from __future__ import annotations
-
 import difflib
 import logging
 import shlex

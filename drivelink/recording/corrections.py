@@ -1,7 +1,5 @@
 """Formats the gate's findings on units, signs, gears and time, with lines for the joint file."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

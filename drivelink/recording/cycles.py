@@ -3,8 +3,6 @@
 `SyncClock` has to decide at once, and cannot distinguish late SYNCs from what follows a lost one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 A file is read line by line; only the numbers of known columns are kept in memory.
 """
 
-from __future__ import annotations
-
 import csv
 import logging
 import math

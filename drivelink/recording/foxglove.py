@@ -3,8 +3,6 @@
 The live server is foxglove-sdk's: `pip install drivelink-vsa[foxglove]`.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from functools import cache

@@ -3,8 +3,6 @@
 All later code counts periods. Stamps are only used here, to find period, gaps and errors.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from typing import NamedTuple

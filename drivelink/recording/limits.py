@@ -4,8 +4,6 @@ A file declares the lengths of its parts and may declare anything. Real recordin
 (docs/reference/recordings.md). python-can's reader accepts lines of any length, and ignores relative stamps.
 """
 
-from __future__ import annotations
-
 import io
 import logging
 import re

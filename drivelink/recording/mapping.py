@@ -3,8 +3,6 @@
 An MCAP file carries both; other formats get a file beside them: `r.log` has `r.log.mapping.json`.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path

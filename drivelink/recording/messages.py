@@ -4,8 +4,6 @@ Foxglove and PlotJuggler plot JSON without a plugin. Names are those of the CSV 
 null.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

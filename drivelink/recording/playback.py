@@ -1,7 +1,5 @@
 """Plays a recording through the pipeline of live data, and writes, publishes and counts what comes out."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

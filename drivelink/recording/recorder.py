@@ -3,8 +3,6 @@
 It only subscribes and receives. Data wait in zenoh's and the kernel's queues; drops are counted.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import math

@@ -3,8 +3,6 @@
 A sink buffers in memory; `flush`, called once a second, writes whole blocks to disk.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os

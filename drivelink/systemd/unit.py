@@ -1,7 +1,5 @@
 """The systemd service of a joint: its unit file, and sd_notify(3): ready, stopping, watchdog."""
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import re

@@ -5,8 +5,6 @@ PDOs are packed from `Entry.value`, without a dictionary access. Refusals are SD
 (CiA 301, 7.2.4.3.17); `canopen.SdoAbortedError` carries one to the client.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from enum import IntEnum

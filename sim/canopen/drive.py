@@ -1,7 +1,5 @@
 """A CiA 402 drive as a CANopen slave: state machine, torque modes, a second encoder, units in its objects."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from enum import IntEnum

@@ -1,7 +1,5 @@
 """Electronic data sheets (CiA 306): the object dictionaries of the simulated devices."""
 
-from __future__ import annotations
-
 import io
 import re
 from configparser import RawConfigParser

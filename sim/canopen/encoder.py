@@ -1,7 +1,5 @@
 """A CiA 406 encoder as a CANopen slave."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from sim.canopen.dictionary import Abort, SdoAbortedError

@@ -1,7 +1,5 @@
 """A CANopen slave: NMT state machine, and the services that depend on its state (CiA 301)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from enum import IntEnum
 

@@ -4,8 +4,6 @@ Their objects are in `sim/eds`, after public EDS and DCF files and manuals; name
 makers'. Here is what an EDS file cannot express.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sim.errors import SimError

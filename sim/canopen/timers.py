@@ -1,7 +1,5 @@
 """Timers of simulated devices, on whatever clock the network keeps."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Hashable
 

@@ -7,8 +7,6 @@ to tau_e. Names and parameters are the estimator's, so that a model can be simul
 independent.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Iterable, Mapping

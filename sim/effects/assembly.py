@@ -1,7 +1,5 @@
 """Assembles a joint from its parts and the contributions of effects, some of which they share."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace

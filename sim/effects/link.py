@@ -1,7 +1,5 @@
 """Effects at the link, and in the measurement of positions: a reading is the true angle plus its error."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

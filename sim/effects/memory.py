@@ -4,8 +4,6 @@ Each memory keeps its state of the last step: `torque` evaluates another displac
 `commit` moves there.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Effects at the motor: friction, ripple, and differences between acting and reported torque."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

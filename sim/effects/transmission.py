@@ -1,7 +1,5 @@
 """Effects of the transmission, acting on both sides."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Effects outside the estimator's library, to test diagnosis on the unknown."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

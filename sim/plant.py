@@ -180,9 +180,8 @@ class Terms:
 
     loads: list[Load] = field(default_factory=list)  # x(position, velocity), N·m
     dry: list[Dry] = field(default_factory=list)  # levels of dry friction, N·m
-    extras: list[Extra] = field(
-        default_factory=list
-    )  # of a motor's transmission, added to tau_e on both sides
+    # Of a motor's transmission, added to tau_e on both sides.
+    extras: list[Extra] = field(default_factory=list)
     kinematics: list[Kinematics] = field(default_factory=list)  # of a motor's gear
     commits: list[Commit] = field(default_factory=list)  # memories to update at each step
     reshape: list[Callable[[Law], Law]] = field(default_factory=list)  # of a motor's spring, applied in order

@@ -169,9 +169,8 @@ def test_memory_holds_no_more_than_is_kept_and_ten_alarms_a_minute_make_one_reco
         scene.run(24, Status.MODEL_ALARM)
         scene.run(24)
     assert len(scene.finish()) == 1
-    monkeypatch.setattr(
-        blackbox, "_BLOCK_ITEMS", 10
-    )  # of a bus that is flooded: ten seconds in eleven blocks
+    # Of a bus that is flooded: ten seconds in eleven blocks.
+    monkeypatch.setattr(blackbox, "_BLOCK_ITEMS", 10)
     ring = blackbox.Ring(10.0)
     for number in range(500):
         ring.take((0.0, "frame", (number,)))
@@ -198,10 +197,8 @@ def test_a_cycle_takes_no_more_memory_than_its_messages_take_on_the_wire(tmp_pat
         ({"suspected": {"reason": "frozen", "text": "link"}}, "suspected signal"),
         ({"drive_faults": ["node 1: fault"]}, "drive fault"),
         ({"state": "bus lost"}, "bus lost"),
-        (
-            {"suspected": {"reason": "late", "text": "link"}},
-            "",
-        ),  # a reading whose frames come late is no event
+        # A reading whose frames come late is no event.
+        ({"suspected": {"reason": "late", "text": "link"}}, ""),
     ],
 )
 def test_events_of_the_status_are_kept(status, cause, tmp_path):
@@ -363,9 +360,8 @@ def test_a_box_that_begins_leaves_the_recording_that_another_one_still_writes(tm
     """Of a daemon that was killed, while the next one begins."""
     first, others, wrote = Scene(tmp_path), [], blackbox.McapSink.mapping
     first.box.mapping({"joint": "elbow", "nodes": []}, 1)
-    monkeypatch.setattr(
-        blackbox.McapSink, "mapping", lambda *a: others.append(Scene(tmp_path)) or wrote(*a)
-    )  # begins meanwhile
+    # Begins meanwhile.
+    monkeypatch.setattr(blackbox.McapSink, "mapping", lambda *a: others.append(Scene(tmp_path)) or wrote(*a))
     first.run(100)
     first.run(200, Status.MODEL_ALARM)
     assert len(first.finish()) == len(others) == 1

@@ -284,9 +284,8 @@ def test_a_full_transmit_queue_costs_time_only_and_an_interface_that_is_down_is_
     assert layout.tpdos[0].cob_id == 0x185
     with pytest.raises(BusError, match=r"cannot be sent: .*Network is down"):
         configure(Failing(errno.ENETDOWN, "Network is down", [drive()]), parse(joint_text()))
-    wire.error = BrokenPipeError(
-        errno.EPIPE, "Broken pipe"
-    )  # by a server that has gone: it is no closed stdout
+    # By a server that has gone: it is no closed stdout.
+    wire.error = BrokenPipeError(errno.EPIPE, "Broken pipe")
     with pytest.raises(BusError, match=r"cannot be sent: Broken pipe"):
         configure(wire, parse(joint_text()))
 

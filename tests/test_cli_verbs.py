@@ -277,8 +277,7 @@ def test_an_interrupt_while_modules_are_loaded_prints_no_traceback(tmp_path):
     ended = subprocess.run([sys.executable, "-m", "drivelink"], env=path, capture_output=True, timeout=60)
     assert (ended.returncode, ended.stderr) == (-signal.SIGINT, b"")
     (tmp_path / "argparse.py").unlink()
-    (tmp_path / "json.py").write_text(
-        f"{stub}import sys\nsys.exit(7)\n"
-    )  # ignored, as behind `&` in a script
+    # Ignored, as behind `&` in a script.
+    (tmp_path / "json.py").write_text(f"{stub}import sys\nsys.exit(7)\n")
     behind = ["sh", "-c", f"trap '' INT; exec {sys.executable} -m drivelink"]
     assert subprocess.run(behind, env=path, capture_output=True, timeout=60).returncode == 7

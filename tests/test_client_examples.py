@@ -49,9 +49,8 @@ def test_the_python_examples_run(daemon, name, expected, more):
 
 @pytest.mark.slow
 def test_python_examples_end_without_a_traceback_by_ctrl_c_and_where_nobody_reads_on(daemon):
-    buffered = {
-        "PYTHONUNBUFFERED": ""
-    }  # as a user's shell: what is printed comes through a pipe all the same
+    # As a user's shell: what is printed comes through a pipe all the same.
+    buffered = {"PYTHONUNBUFFERED": ""}
     with ExitStack() as stack:  # at once: each prints a line now and then
         running = [
             (

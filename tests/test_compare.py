@@ -46,9 +46,8 @@ def test_two_machines_differ_in_the_stiffness_and_each_model_fits_its_own(runs):
     assert "Where the curves differ most" in repr(made) and len(repr(made)) < 5000
     out = io.StringIO()
     show(made.sections(), Console(file=out, width=80))
-    assert re.search(
-        r"│ friction / N·m +│ +\S+ │ +\S+ │ +\S+ rad/s │ +\S+ σ │\n", out.getvalue()
-    )  # no cell folds
+    # No cell folds.
+    assert re.search(r"│ friction / N·m +│ +\S+ │ +\S+ │ +\S+ rad/s │ +\S+ σ │\n", out.getvalue())
     assert abs(stiffness.b / stiffness.a - 0.9) < 0.02
     assert abs(stiffness.b - stiffness.a) > 10.0 * stiffness.std > 0.0
     assert abs(friction.b - friction.a) < 5.0 * friction.std
@@ -146,9 +145,8 @@ def test_the_horizon_shrinks_until_a_drifting_run_fits_and_windows_begin_behind_
     lossy = truth.rows(np.arange(len(truth)) % 400 != 399)  # a busy machine: no second is whole
     assert free_run(lossy, joint()).horizon_s < 0.4
     made = simulated(lossy, fitted=joint(effects=(FRICTION,)))["fitted"]
-    assert (
-        made.fit_percent == free_run(lossy, joint(effects=(FRICTION,))).fit_percent
-    )  # one figure everywhere
+    # One figure everywhere.
+    assert made.fit_percent == free_run(lossy, joint(effects=(FRICTION,))).fit_percent
     assert 0.38 < made.horizon_s < 0.4 and len(made.time_s) == 3 * 389
     assert min(made.fit_percent.values()) > 95.0
 

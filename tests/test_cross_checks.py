@@ -82,9 +82,8 @@ def test_a_lie_is_found_named_and_nothing_valid_said_until_it_is_over(calibrated
     for _ in range(6):  # 3000 cycles are enough
         after = calibrated.run(500)[-1]
         over = not after.status & Status.CONTRADICTED and "contradicts" not in checks(calibrated).values()
-        if over and (
-            name not in UNUSED or after.status & Status.VALID
-        ):  # else the estimator has its own way back
+        # Else the estimator has its own way back.
+        if over and (name not in UNUSED or after.status & Status.VALID):
             break
     else:
         raise AssertionError(f"not over: {checks(calibrated)}, {after}")

@@ -181,10 +181,8 @@ def test_a_bus_that_may_not_be_touched_is_judged_by_its_frames():
                 while (message := spy.recv(0.0)) is not None:
                     frames.append(message)
     passive = text.replace("[bus]", '[bus]\nconfigure = false\nsync = "follow"')
-    for direction in (
-        1,
-        -1,
-    ):  # of the encoder: the map is the real one, what the joint file says of it is not
+    # Of the encoder: the map is the real one, what the joint file says of it is not.
+    for direction in (1, -1):
         joint = parse(passive.replace('source = "cia406"', f'source = "cia406"\ndirection = {direction}'))
         configurator = PassiveConfigurator([joint])
         configurator.adopt([turned(one) if one.motor is None and direction < 0 else one for one in layouts])

@@ -65,9 +65,8 @@ def test_from_recordings_to_a_page(fleet, tmp_path, capsys):
     assert document["schema"] == "drivelink.fleet/1"
     assert {one["joint"]: one["recordings"] for one in document["joints"]} == {"elbow": 3}
     page = (out / "fleet.html").read_text()
-    assert not re.search(
-        r"""(?:src|href)=["']?(?:\w+:)?//|url\(|@import|<script|<link""", page
-    )  # self-contained
+    # Self-contained.
+    assert not re.search(r"""(?:src|href)=["']?(?:\w+:)?//|url\(|@import|<script|<link""", page)
     validated = {r["validated_on"].rpartition("/")[2] for r in rows if r["status"] == "done"}
     assert len(validated) == 2 and validated < {HELD_OUT, "elbow-2026-01-05.csv", "elbow-2026-01-05-copy.csv"}
     for r in rows:

@@ -176,9 +176,8 @@ def test_joints_come_by_urgency_with_what_changed_since_when():
     joints = {one["joint"]: one for one in document["joints"]}
     assert [one["state"] for one in document["joints"]] == ["changing"] * 3 + ["steady"]
     gone = night("steps", 20, 150.0, []) | {"status": "error", "error": "no frames"}
-    first = summarise([*rows, gone], 0.05)["joints"][
-        0
-    ]  # what shows nothing any more comes before what changes
+    # What shows nothing any more comes before what changes.
+    first = summarise([*rows, gone], 0.05)["joints"][0]
     assert (first["joint"], first["state"]) == ("steps", "lost") and "stepped by +" in first["sentence"]
     (drift,) = joints["drifts"]["transmissions"][0]["changes"]
     assert drift["kind"] == "drift"

@@ -78,10 +78,8 @@ def test_each_fault_is_named(kind):
     drawn = gatekit.draw(kind, 0, effects=False, seconds=6.0)
     for name, factors in gatekit.faults(drawn).items():
         judgement = judge(gatekit.faulty(drawn.record, factors), drawn.model)
-        if (kind, name) == (
-            "serial",
-            "link in degrees",
-        ):  # curves of motor and link explain as much: odds of 200
+        # Curves of motor and link explain as much: odds of 200.
+        if (kind, name) == ("serial", "link in degrees"):
             assert judgement.findings == () and "the unit of the link position" in judgement.remark
         else:
             assert named(list(judgement.findings), factors), (kind, name, judgement)
@@ -273,9 +271,8 @@ node_id = 1
 def test_what_comes_from_drives_is_corrected_at_the_drive(changes, lines):
     needed = [Change(channel, factor) for channel, factor in changes.items()]
     assert [str(c) for c in corrections(parse(DRIVES), needed, live=True)] == lines
-    turned = parse(
-        DRIVES.replace("node_id = 2", "node_id = 2\ntorque_direction = -1")
-    )  # wrongly, it turns out
+    # Wrongly, it turns out.
+    turned = parse(DRIVES.replace("node_id = 2", "node_id = 2\ntorque_direction = -1"))
     (back,) = corrections(turned, [Change("motor2_torque", -1.0)], live=True)
     assert str(back) == "motor[2].drive.torque_direction = 1"
 

@@ -70,10 +70,8 @@ def truth(node):
 
 def bus():
     signals = {node: truth(node) for node in (1, 5)}
-    lines = [
-        Line(-2e-4, 0x285, struct.pack("<h", 7)),
-        Line(-1e-4, 0x701, b"\x05"),
-    ]  # in the middle of a cycle
+    # In the middle of a cycle.
+    lines = [Line(-2e-4, 0x285, struct.pack("<h", 7)), Line(-1e-4, 0x701, b"\x05")]
     for k in range(CYCLES):
         t = k * 1e-3
         lines.append(Line(t, 0x080, b""))

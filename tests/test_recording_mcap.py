@@ -186,9 +186,8 @@ def test_batches_of_any_length_and_another_run_of_the_daemon_are_cycles_with_the
     path = tmp_path / "r.mcap"
     sink = open_sink(path, JOINT)
     runs = (2500, 1200)
-    for begin in range(
-        0, sum(runs), batch
-    ):  # all samples that wait, then all estimates, as a recorder takes them
+    # All samples that wait, then all estimates, as a recorder takes them.
+    for begin in range(0, sum(runs), batch):
         waiting = [
             (k if k < runs[0] else k - runs[0], k) for k in range(begin, min(begin + batch, sum(runs)))
         ]

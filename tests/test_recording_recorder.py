@@ -112,9 +112,8 @@ def test_a_bus_is_recorded_by_listening_only(tmp_path):
         listen("blind.mcap", blind)
         with daemonkit.rig(joint) as rig:
             run(20)
-            listen(
-                "late.csv", layouts=list(rig.daemon.layouts.values())
-            )  # the mapping is no longer on the bus
+            # The mapping is no longer on the bus.
+            listen("late.csv", layouts=list(rig.daemon.layouts.values()))
             run(150)
             samples = [sample.motor_position_rad for sample, _ in rig.collector.samples]
         _, sink, recorder = taps["blind.mcap"]

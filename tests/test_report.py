@@ -104,9 +104,8 @@ def test_the_report_is_self_contained_and_has_the_verdict_units_bands_the_winner
     assert page.index("<h2>Notes") < page.index("error after over before")
     for foreign in ("#ffffff", 'src="http', 'href="http', "@import", "<script"):
         assert foreign not in page
-    assert (
-        page.count("<svg") >= 3 and page.count("▶ ") == 2
-    )  # the one that was chosen, and what the mark means
+    # The one that was chosen, and what the mark means.
+    assert page.count("<svg") >= 3 and page.count("▶ ") == 2
     assert re.search(r'<tr class="chosen"><th>▶ Coulomb friction</th><td>(0\.9\d|1\.00)</td>', page)
     assert re.search(r"<th>torque_<wbr>nm</th><td>0\.\d+</td><td>\S+</td><td>N·m</td>", page)
     assert re.search(r"<th>k_<wbr>nm_<wbr>rad</th><td>\S+</td><td>\S+</td><td>N·m/rad</td>", page)

@@ -33,12 +33,8 @@ PRE, START, SYNC, RANGE, STATE = "000 80 00", "000 01 00", "080", 0x06090030, 0x
 # an object that is written with its size, and the abort code or 0.
 HABITS: dict[str, list[str | tuple[int, ...]]] = {
     "strict": [
-        *(
-            (0x6077, 0, 500),
-            (0x6078, 0, 250),
-            (0x608F, 1, 4096),
-            (0x6091, 1, 1),
-        ),  # 0.05 of 0.1 N·m, 0.5 of 2 A
+        # 0.05 of 0.1 N·m, 0.5 of 2 A.
+        *((0x6077, 0, 500), (0x6078, 0, 250), (0x608F, 1, 4096), (0x6091, 1, 1)),
         *((0x60A9, 0, 0x00100300, 4, 0), (0x606C, 0, 3), (0x607E, 0, 0x40, 1, 0), (0x606C, 0, 0xFFFF_FFFD)),
         (0x60A9, 0, 0x00FF0300, 4, RANGE),
     ],

@@ -72,11 +72,8 @@ def slope(x, regressor):
     return float(regressor[inside] @ x[inside] / (regressor[inside] @ regressor[inside]))
 
 
-ACROSS = {
-    "motor": (1.0, 0.0),
-    "link": (0.0, 1.0),
-    "transmission": (-1.0, 1.0),
-}  # sign at the motor, at the link
+# Sign at the motor, at the link.
+ACROSS = {"motor": (1.0, 0.0), "link": (0.0, 1.0), "transmission": (-1.0, 1.0)}
 OMEGA, THETA, LINK, LINK_RATE = (f"truth_{n}" for n in (
     "motor1_velocity_rad_s", "motor1_position_rad", "link_position_rad", "link_velocity_rad_s"))  # fmt: skip
 PHI, TAU_E = "truth_motor1_deflection_rad", "truth_motor1_flexibility_torque_nm"

@@ -90,9 +90,8 @@ def test_the_log_ends_what_it_has_begin_and_nothing_else(events, clock, caplog):
     for second in range(3600):
         clock[0] = float(second)
         events.begin("slow", "it does not keep up")
-        clock[0] += (
-            0.1 if second % 7 else 9.0
-        )  # after a longer time, too, in which an end alone would be news
+        # After a longer time, too, in which an end alone would be news.
+        clock[0] += 0.1 if second % 7 else 9.0
         events.end("slow", "it keeps up again")
     said = [message.partition(" (")[0] for message in caplog.messages]
     assert 4 < len(said) < 30 and said == ["it does not keep up", "it keeps up again"] * (len(said) // 2)

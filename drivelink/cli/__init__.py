@@ -61,11 +61,8 @@ ALONE = (
     "with --interface socketcand, `drivelink sim` and `drivelink run` meet over TCP"
 )
 _INTERRUPTED = 130
-_OPTIONS = {
-    "force=True": "--force",
-    "joint=FILE": "--joint FILE",
-    "names: ": "--map: ",
-}  # as errors name them
+# As errors name them.
+_OPTIONS = {"force=True": "--force", "joint=FILE": "--joint FILE", "names: ": "--map: "}
 
 
 _EPILOG = """\

@@ -155,11 +155,8 @@ _COUNTED = (  # counter of a node; its smallest reported increase, and the messa
 )
 
 
-LATE_FRAMES = (
-    "missing ",
-    "conflicting ",
-    "too slow",
-)  # what conditions begin with whose readings may be older ones
+# What conditions begin with whose readings may be older ones.
+LATE_FRAMES = ("missing ", "conflicting ", "too slow")
 _BUNCHED = (
     "some frames are missing, others come several in one cycle and are not used: "
     "this machine or the bus is too slow for the cycle, or another device has its node id"

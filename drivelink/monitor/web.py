@@ -319,10 +319,8 @@ class _Handler(BaseHTTPRequestHandler):
         if isinstance(content, bytes):
             self._send(kind, content)
             return
-        with (
-            suppress(OSError),
-            open(content, "rb", opener=findings.open_own) as file,
-        ):  # dropped, or the browser has closed the connection
+        # Dropped, or the browser has closed the connection.
+        with suppress(OSError), open(content, "rb", opener=findings.open_own) as file:
             self._head(kind, os.fstat(file.fileno()).st_size)
             shutil.copyfileobj(file, self.wfile)
 

@@ -32,12 +32,8 @@ Spring = Callable[[float], tuple[float, float]]  # deflection: torque, stiffness
 class Settings:
     """Limits and times."""
 
-    targets: tuple[tuple[float, float], ...] = (
-        (0.4, 0.75),
-        (-0.3, 0.55),
-        (0.3, 0.85),
-        (0.0, 0.6),
-    )  # q, sigma
+    # Each is (q, sigma).
+    targets: tuple[tuple[float, float], ...] = ((0.4, 0.75), (-0.3, 0.55), (0.3, 0.85), (0.0, 0.6))
     way_s: float = 1.5  # from one target to the next, for ever
     rest_s: float = 1.0  # at each
     reaction: str = "stop"  # to a contact: "stop" stays, "retract" yields, "soften" lowers the stiffness

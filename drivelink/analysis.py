@@ -349,10 +349,6 @@ def diagnose(
         recordings: as of `fit`; so are joint, bandwidth_hz (Hz), names, strict and warn.
         joint: the joint file that `Fit.write` made of a healthy run, for best results.
         validation: held-out recording; left out: held-out blocks of the same ones.
-        bandwidth_hz: see recordings.
-        names: see recordings.
-        strict: see recordings.
-        warn: see recordings.
         progress: called with the name of each stage.
 
     Raises:

@@ -36,11 +36,7 @@ def correlations(
     """Correlate a free run's residual with itself and with the motor torque, within its windows.
 
     Args:
-        run: of that recording.
-        record: as it was simulated.
         channel: of `run.channels`.
-        motor: whose torque.
-        longest_s: lag.
 
     Returns:
         Autocorrelation (band: of white noise) and cross-correlation (band: of independent signals as coloured

@@ -80,8 +80,6 @@ def harm(
     """Say in one clause what a model makes worse than the declared one; None: nothing.
 
     Args:
-        declared: the joint as declared.
-        written: as it is to be written.
         unseen: data that took no part in making it.
         settings: of the on-line estimator; left out: the defaults.
     """
@@ -106,11 +104,7 @@ def harm_of_parts(
     """Say what a model makes worse in the last quarter of each recording, where it is made of the others.
 
     Args:
-        declared: the joint as declared.
         written: made of all data; it is compared on them where a part determines no stiffness.
-        records: all data.
-        make: makes the model of some.
-        settings: see `harm`.
     """
     if not can_monitor(written):
         return harm(declared, written, [], settings)

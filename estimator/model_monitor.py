@@ -79,7 +79,6 @@ def seconds_of(record: Record, model: JointModel) -> list[Second]:
     """Measure the residual of a model second by second, as the daemon does.
 
     Args:
-        record: the samples.
         model: as written, transmission parameters included; nothing is fitted.
     """
     monitor, made = ModelMonitor(model, record.period_s, None), []

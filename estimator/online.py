@@ -221,11 +221,6 @@ def _with_interval(value: float, std: float) -> str:
 def make_estimator(model: JointModel, settings: EstimatorSettings, period_s: float) -> Estimator:
     """Make the estimator that the settings select.
 
-    Args:
-        model: of the joint.
-        settings: mode, gains and bandwidths.
-        period_s: of the samples.
-
     Raises:
         EstimatorError: the model names a transmission that does not exist, or contradicts itself.
     """

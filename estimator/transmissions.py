@@ -38,7 +38,6 @@ def register(
     """Add the model f(phi) = k_nm_rad * torque(phi, *shape) under a name for the joint file.
 
     Args:
-        name: its name.
         torque: g(phi, *shape), odd in phi, on arrays.
         stiffness: dg/dphi, its analytic derivative, on arrays.
         shape: start, low and high of each nonlinear parameter, by name, in the order of the arguments.
@@ -84,7 +83,6 @@ def register_table(
     """Add a measured curve under a name for the joint file: k_nm_rad (1: as measured) times the table.
 
     Args:
-        name: its name.
         deflection_rad: increasing, all above 0; the curve is odd and passes through 0.
         torque_nm: the torque at each of them.
 

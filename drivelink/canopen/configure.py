@@ -138,7 +138,6 @@ def configure_joints(
 
     Args:
         joints: joint files with `configure = true`; the first one's bus section counts.
-        idle: called between receptions, e.g. the simulated devices' `poll` in lockstep.
 
     Returns:
         The configurator, which knows the layouts, for reboots in the run.

@@ -87,9 +87,6 @@ def listen(bus: FrameBus, seconds: float, on_frame: Callable[[can.Message], None
 def scan(bus: FrameBus, node_ids: Iterable[int] = range(1, 128)) -> tuple[list[int], Traffic]:
     """Ask node ids for their device type.
 
-    Args:
-        node_ids: ids to ask; default: all.
-
     Returns:
         Ids of the nodes that answered or were heard, and the traffic meanwhile.
     """

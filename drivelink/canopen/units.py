@@ -47,11 +47,7 @@ def unit_objects(role: Role, vendor: Vendor) -> tuple[Address, ...]:
 
 
 def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
-    """Return signals that a node can send, with their scales.
-
-    Args:
-        role: role of the node, with its section of the joint file.
-    """
+    """Return signals that a node can send, with their scales."""
     result = Offer()
     reported = {address: value for address, value in reported.items() if value != _ERASED}
     vendor = vendor.generation(reported)

@@ -121,10 +121,6 @@ def velocity_unit_rad_s(unit: int, counts_per_rev: float | None) -> float | None
     Byte 3 is the power of ten, byte 2 the numerator, byte 1 the denominator (CiA 303-2): 0x00B44700 is
     revolutions per minute, 0x00B50300 increments per second.
 
-    Args:
-        unit: value of 0x60A9.
-        counts_per_rev: counts per revolution, for a unit of increments.
-
     Returns:
         The unit, or None where it is none of an angle per time.
     """

@@ -275,9 +275,6 @@ class JoinedBus(can.BusABC):
     """A socketcand bus that another process serves; detects its end.
 
     python-can's client then returns immediately without a frame, forever.
-
-    Args:
-        bus: python-can's client.
     """
 
     def __init__(self, bus: can.BusABC) -> None:

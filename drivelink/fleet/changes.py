@@ -114,13 +114,8 @@ def series_test(time_s: FloatArray, value: FloatArray, std: FloatArray) -> Serie
 def changes(time_s: FloatArray, value: FloatArray, std: FloatArray, level: float) -> list[SeriesChange]:
     """Return the changes of a series, one after the other as long as the next is significant.
 
-    Args:
-        time_s: (n,) increasing.
-        value: (n,) estimates.
-        std: (n,) their standard deviations.
-
     Returns:
-        In order of time; empty where the first is not significant.
+        Those of a series as of `series_test`, in order of time; empty where the first is not significant.
     """
     n = len(value)
     if n < LEAST:

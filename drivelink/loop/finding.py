@@ -194,8 +194,6 @@ def newest(folder: Path, joint: str, *, finished: bool = False) -> tuple[Path, d
     """Return the newest recording of a joint with a finding, and that; None: there is none.
 
     Args:
-        folder: of its recordings.
-        joint: its name.
         finished: only of those whose diagnosis is over.
     """
     try:

@@ -34,8 +34,6 @@ def as_json(
     """Return the content of fit.json.
 
     Args:
-        found: the fit.
-        names: of the recordings.
         runs: of each recording: the free run of the fitted model.
         notes: what the gate says of them.
     """

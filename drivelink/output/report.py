@@ -75,7 +75,6 @@ def as_json(outcome: Diagnosis, runs: Mapping[str, FreeRun], of: str) -> dict[st
     """Return the content of report.json.
 
     Args:
-        outcome: the diagnosis.
         runs: free runs of the joint as "declared" and with what was "found", where it can be simulated.
         of: the recording that they are of.
     """

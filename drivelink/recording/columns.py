@@ -96,9 +96,7 @@ def renamed(
     """Return the columns under our names in SI units; sources are no longer available by their own names.
 
     Args:
-        columns: that were read.
         names: of ours, where they come from.
-        where: the file.
         unread: names of its other columns.
 
     Raises:

@@ -36,9 +36,6 @@ def _plots(motors: int) -> list[tuple[str, str, list[str]]]:
 def write_layouts(joint: JointFile, folder: Path) -> list[Path]:
     """Write `foxglove.json` and `plotjuggler.xml`.
 
-    Args:
-        joint: the joint; its name is part of the topics.
-
     Raises:
         OSError: they cannot be written.
     """

@@ -157,10 +157,9 @@ def simulate(
 def pulled(
     torque: Callable[[Array], Array], stiffness: Callable[[Array], Array], pull: float, n: int, seed: int = 0
 ) -> tuple[Truth, Record]:
-    """A joint of 0.12 kg·m² and 0.8 N·m·s/rad that goes from place to place, its link pulled by a weight or another
-    spring: the deflection stays on one side. The truth, and what fine encoders and a noisy drive read."""
-    period_s, load = 1e-3, 0.45
-    places = np.random.default_rng(seed).uniform(-0.6, 0.6, n // 1000 + 2)
+    """A joint that goes from place to place, its link pulled by a weight or another spring: the deflection stays on one
+    side. The truth, and what fine encoders and a noisy drive read."""
+    places, load = np.random.default_rng(seed).uniform(-0.6, 0.6, n // 1000 + 2), 0.45
 
     def more(_t: float, _state: Array, rate: Array, _tau: Array) -> None:
         rate[:, 3] += pull / load
@@ -170,22 +169,14 @@ def pulled(
         wanted = places[at] + (places[at + 1] - places[at]) * share**2 * (3.0 - 2.0 * share)
         return np.asarray(400.0 * (wanted - state[:, :1]) - 14.0 * state[:, 1:2])
 
-    truth = simulate(
-        Plants(torque, stiffness, 0.12, 0.8, load, 0.3, 3.0, more=more),
-        follow,
-        period_s,
-        size=(n, 1, 1),
-        method=HEUN,
-    )
-    noise = np.random.default_rng(5).normal(0, 0.02, (n, 1))
-    how = {"motor_counts": 131072, "link_bits": 18, "velocity_rad_s": None, "torque_noise": noise}
-    return truth, record(truth, 0, period_s, **how)
+    plants = Plants(torque, stiffness, 0.12, 0.8, load, 0.3, 3.0, more=more)
+    return _controlled(plants, follow, n, 0.02, motor_counts=131072, link_bits=18)
 
 
 def guided(
     torque: Callable[[Array], Array], stiffness: Callable[[Array], Array], n: int
 ) -> tuple[Truth, Record]:
-    """A joint of 0.12 kg·m² and 0.8 N·m·s/rad that a hand moves while its drive only damps: the truth, and what is read."""
+    """A joint that a hand moves while its drive only damps: the truth, and what is read."""
     rng, load = np.random.default_rng(0), 0.55
     hz, phase = rng.uniform(0.2, 3.0, 8), rng.uniform(0.0, 2.0 * np.pi, 8)
 
@@ -195,16 +186,16 @@ def guided(
     def damp(_k: int, state: Array) -> Array:
         return np.asarray(-0.33 * state[:, 1:2])
 
-    truth = simulate(
-        Plants(torque, stiffness, 0.12, 0.8, load, 0.13, 0.02, more=hand),
-        damp,
-        1e-3,
-        size=(n, 1, 1),
-        method=HEUN,
-    )
-    noise = np.random.default_rng(5).normal(0, 0.0125, (n, 1))
-    how = {"motor_counts": 8192, "link_bits": 17, "velocity_rad_s": None}
-    return truth, record(truth, 0, 1e-3, **how, torque_noise=noise)
+    plants = Plants(torque, stiffness, 0.12, 0.8, load, 0.13, 0.02, more=hand)
+    return _controlled(plants, damp, n, 0.0125, motor_counts=8192, link_bits=17)
+
+
+def _controlled(
+    plants: Plants, controller: Callable[[int, Array], Array], n: int, noise_nm: float, **counts: float
+) -> tuple[Truth, Record]:
+    truth = simulate(plants, controller, 1e-3, size=(n, 1, 1), method=HEUN)
+    noise = np.random.default_rng(5).normal(0, noise_nm, (n, 1))
+    return truth, record(truth, 0, 1e-3, velocity_rad_s=None, torque_noise=noise, **counts)
 
 
 def quantise(x: Array, step: float) -> Array:

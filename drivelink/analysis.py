@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivelink import jointfile, recording
-from drivelink.errors import HarmfulModelError, RecordingError, UsageError
+from drivelink.errors import HarmfulModelError, RecordingError, UsageError, raised_as
 from drivelink.files import check_target
 from drivelink.jointfile import apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import as_read, diagnosed_model, floor_entry
@@ -91,10 +91,8 @@ class Fit:
                 )
         joint, names = self.runs.source.joint, parse_column_map(self.runs.names)
         record = recording.read(path, joint, base_dir=self.runs.source.folder, names=names)
-        try:
+        with raised_as(RecordingError, str(path), EstimatorError):
             return free_run(record, self.found.model, horizon_s)
-        except EstimatorError as error:
-            raise RecordingError(f"{path}: {error}") from error
 
     def plot(self) -> Picture:
         """Draw stiffness (N·m/rad), torque and residuals (N·m) of each flexible transmission.
@@ -244,11 +242,9 @@ class Diagnosed:
             RecordingError: nothing is left open, or no motion within the limits moves the joint.
         """
         model, joint = self.runs.source.joint.model(), self.runs.source.joint
-        try:
+        with raised_as(RecordingError, f"{self.runs.named}: --motion", EstimatorError):
             limits = Limits.declared(self.runs.records, **joint.motion.model_dump())
             found = design(self.runs.records, model, self.outcome, limits, seconds, progress)
-        except EstimatorError as error:
-            raise RecordingError(f"{self.runs.named}: --motion: {error}") from error
         return replace(self, motion=found)
 
     def write_motion(self, target: str | Path, *, force: bool = False) -> list[Path]:
@@ -323,10 +319,8 @@ def fit(
     """
     runs = load(recordings, joint, names=names, strict=strict, warn=warn)
     bandwidth = None if bandwidth_hz is None else 2.0 * math.pi * bandwidth_hz
-    try:
+    with raised_as(RecordingError, some(runs.paths), EstimatorError):
         found = identify(list(runs.records), runs.source.joint.model(), bandwidth)
-    except EstimatorError as error:
-        raise RecordingError(f"{some(runs.paths)}: {error}") from error
     for name, one in zip(runs.names_of_files, found.recordings, strict=True):
         _require_explained(name, one.train.relative, choice("unexplained"))
     return Fit(runs, found, bandwidth)
@@ -360,10 +354,8 @@ def diagnose(
         other = load(validation, joint, names=names, strict=strict, warn=warn)
         held, told = other.records[0], tuple(dict.fromkeys((*told, *other.notes)))
     model = runs.source.joint.model()
-    try:
+    with raised_as(RecordingError, runs.named, EstimatorError):
         outcome = _diagnose(list(runs.records), model, bandwidth_hz, held, progress)
-    except EstimatorError as error:
-        raise RecordingError(f"{runs.named}: {error}") from error
     _require_explained(runs.named, outcome.validation.after_relative, 1.0)
     validated = None if validation is None else Path(validation).name
     return Diagnosed(replace(runs, notes=told), outcome, validated, held)

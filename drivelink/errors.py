@@ -1,5 +1,8 @@
 """The service's exceptions. Each is one line for the user: what, where, what was expected."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from drivelink.plaintext import clean_text
 
 _LONGEST = 900  # characters of a message: a file's own words may be longer
@@ -13,6 +16,17 @@ class DrivelinkError(Exception):
     def __str__(self) -> str:
         """Return the message as one line of plain text, cut off where it would fill a screen."""
         return clean_text(super().__str__(), _LONGEST)
+
+
+@contextmanager
+def raised_as(
+    kind: type[Exception], what: str, caught: type[Exception] | tuple[type[Exception], ...] = OSError
+) -> Iterator[None]:
+    """Raise what the system or a library says as an error of this kind: what it is of, and the reason."""
+    try:
+        yield
+    except caught as error:
+        raise kind(f"{what}: {getattr(error, 'strerror', None) or error}") from error
 
 
 class UsageError(DrivelinkError):

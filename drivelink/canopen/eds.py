@@ -12,7 +12,7 @@ from pathlib import Path
 from canopen.objectdictionary import ODVariable, datatypes
 
 from drivelink.canopen.pdo import Tpdo, tpdos_of
-from drivelink.errors import DriveError
+from drivelink.errors import DriveError, raised_as
 from drivelink.files import read_regular
 from drivelink.plaintext import clean_text
 
@@ -76,10 +76,8 @@ def load_eds(path: Path, node_id: int | None = None) -> DataSheet:
     Raises:
         DriveError: it cannot be read, or is not an EDS.
     """
-    try:
+    with raised_as(DriveError, f"{path}: cannot be read as an EDS"):
         raw = read_regular(path, MAX_BYTES)
-    except OSError as error:
-        raise DriveError(f"{path}: cannot be read as an EDS: {error.strerror}") from error
     sheet = DataSheet(path=path)
     if raw.lstrip()[:5].lower() == b"<?xml":
         raise DriveError(f"{path}: is XML (an XDD?), expected an EDS or DCF file")

@@ -14,7 +14,7 @@ from typing import Any
 
 import can
 
-from drivelink.errors import JointFileError, UsageError
+from drivelink.errors import JointFileError, UsageError, raised_as
 from drivelink.files import open_regular
 from drivelink.jointfile import JointFile, MotorSection, SimSection
 from estimator.model import LinkDynamics
@@ -63,7 +63,7 @@ def world_from_joint(
     section = joint.sim or SimSection()
     name = section.case
     asked = _asked(effects)
-    try:
+    with raised_as(JointFileError, f"{file or joint.name}: sim", SimError):
         given = case(name) if name else None
         if given and given.plant.arrangement != joint.arrangement:
             raise SimError(f'case "{name}" is {given.plant.arrangement}, this joint is {joint.arrangement}')
@@ -80,8 +80,6 @@ def world_from_joint(
             period_s=joint.bus.period_s,
             seed=section.seed if seed is None else seed,
         )
-    except SimError as error:
-        raise JointFileError(f"{file or joint.name}: sim: {error}") from error
 
 
 def alter(world: World, effects: Sequence[str], parameters: Mapping[str, float]) -> None:
@@ -187,10 +185,8 @@ def _excitation(
     table = section.excitation
     if table.get("kind") == "motion":
         path = (Path() if file is None else file.parent) / str(table.get("file", ""))
-        try:
+        with raised_as(SimError, f"sim.excitation.file: {path}: cannot be read"):
             open_regular(path).close()
-        except OSError as error:
-            raise SimError(f"sim.excitation.file: {path}: cannot be read: {error.strerror}") from error
         return {**following(plant), **table, "file": str(path)}
     if given is not None and table.get("kind") in (None, given.excitation["kind"]):
         return {**given.excitation, **table}

@@ -15,7 +15,7 @@ from urllib.parse import unquote
 
 from drivelink import jointfile
 from drivelink.canopen.eds import MAX_BYTES
-from drivelink.errors import DrivelinkError, RecordingError, UsageError
+from drivelink.errors import DrivelinkError, RecordingError, UsageError, raised_as
 from drivelink.files import read_regular
 from drivelink.fleet.storage import FleetError
 from drivelink.jointfile import JointFile
@@ -158,8 +158,6 @@ def _eds(joint: JointFile, base: Path) -> tuple[tuple[str, bytes], ...]:
     for name in sorted(names):
         if Path(name).is_absolute() or ".." in Path(name).parts:
             continue  # only paths below the joint file can be recreated elsewhere
-        try:
+        with raised_as(DrivelinkError, f"{base / name}: cannot be read"):
             found.append((name, read_regular(base / name, MAX_BYTES)))
-        except OSError as error:
-            raise DrivelinkError(f"{base / name}: cannot be read: {error.strerror}") from error
     return tuple(found)

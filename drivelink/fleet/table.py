@@ -18,6 +18,7 @@ from uuid import uuid4
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from drivelink.errors import raised_as
 from drivelink.fleet.analysis import NAMED
 from drivelink.fleet.storage import FleetError, Source, Store
 
@@ -268,11 +269,9 @@ def _locked(store: Store) -> int | None:
     if store.folder is None:
         return None
     folder = store.folder / FOLDER
-    try:
+    with raised_as(FleetError, f"{folder}: cannot be written"):
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise FleetError(f"{folder}: cannot be written: {error.strerror}") from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

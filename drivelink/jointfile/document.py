@@ -17,7 +17,7 @@ import tomlkit
 from pydantic import BaseModel, ValidationError
 from tomlkit.container import Container
 
-from drivelink.errors import JointFileError
+from drivelink.errors import JointFileError, raised_as
 from drivelink.files import read_regular, write_whole
 from drivelink.jointfile.schema import JointFile
 from drivelink.plaintext import expected
@@ -230,10 +230,8 @@ def write_model(
     text = f"{_MARK}\n{_apart(tomlkit.dumps(document), before).rstrip()}\n"
     text += f"# drivelink check: sha256 {_digest(text)}\n"
     joint = parse(text, str(target))
-    try:
+    with raised_as(JointFileError, f"{target}: cannot be written"):
         write_whole(target, text, force=force)
-    except OSError as error:
-        raise JointFileError(f"{target}: cannot be written: {error.strerror}") from error
     return joint
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from annotated_types import Gt
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from drivelink.errors import raised_as
 from drivelink.jointfile.columns import COLUMNS, si_factor
 from drivelink.plaintext import expected
 from estimator.effects import LIBRARY, elements
@@ -267,10 +268,8 @@ class RecordingSection(_Section):
                     f'{key}: expected names of columns like "motor1_position_rad", got "{min(unknown)}"'
                 )
         for name, column in self.columns.items():
-            try:
+            with raised_as(ValueError, f"columns.{name}.unit", ValueError):
                 si_factor(name, column.unit)
-            except ValueError as error:
-                raise ValueError(f"columns.{name}.unit: {error}") from error
         for name, factor in self.scale.items():
             require_in_range("scale", factor)
             if factor == 0.0:

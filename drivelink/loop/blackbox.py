@@ -16,7 +16,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from drivelink.errors import JointFileError, RecordingError
+from drivelink.errors import JointFileError, RecordingError, raised_as
 from drivelink.jointfile import JointText, load_text
 from drivelink.loop.day import Day
 from drivelink.loop.finding import (
@@ -145,15 +145,13 @@ class BlackBox(Sink):
         self._last_s: dict[str, float] = {}
         self._event: _Event | None = None
         self._writer: threading.Thread | None = None
-        try:
+        with raised_as(RecordingError, f"{self._folder}: cannot be written"):
             self._folder.mkdir(parents=True, exist_ok=True)
             for left in kept(self._folder, text.joint.name, UNFINISHED):  # by a kill
                 if (lock := _locked(left)) is not None:
                     left.unlink()
                     os.close(lock)
             taken(self._wish).unlink(missing_ok=True)
-        except OSError as error:
-            raise RecordingError(f"{self._folder}: cannot be written: {error.strerror}") from error
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
         """Store what was measured at one SYNC."""

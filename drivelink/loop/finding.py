@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from drivelink.errors import DrivelinkError, JointFileError, RecordingError
+from drivelink.errors import DrivelinkError, JointFileError, RecordingError, raised_as
 from drivelink.files import read_regular, write_whole
 from drivelink.jointfile import JointText
 from drivelink.pubsub.feed import MAX_BYTES, decode_document
@@ -162,10 +162,8 @@ def put(path: Path, text: str) -> None:
     Raises:
         RecordingError: it cannot be written.
     """
-    try:
+    with raised_as(RecordingError, f"{path}: cannot be written"):
         write_whole(path, text, force=True)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def read(recording: Path) -> dict[str, Any] | None:

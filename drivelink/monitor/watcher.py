@@ -10,7 +10,7 @@ from typing import Any
 
 import zenoh
 
-from drivelink.errors import ZenohError
+from drivelink.errors import ZenohError, raised_as
 from drivelink.monitor.view import JointView
 from drivelink.plaintext import clean_text, natural
 from drivelink.pubsub.clientbase import PATIENCE_S, absent, ask
@@ -66,7 +66,7 @@ class Watcher:
         self._claims: deque[zenoh.Sample] = deque()  # tokens that came since the last poll
         ring = zenoh.handlers.RingChannel
         key = self._key = f"{prefix}/{joint or '*'}"
-        try:
+        with raised_as(ZenohError, f"{key}: cannot be subscribed to", zenoh.ZError):
             self._streams: list[tuple[str, Any]] = [
                 (name, session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)))
                 for name in ("estimate", "external")
@@ -76,8 +76,6 @@ class Watcher:
             self._tokens: Any = session.liveliness().declare_subscriber(
                 f"{key}/alive/**", heard, history=True
             )
-        except zenoh.ZError as error:
-            raise ZenohError(f"{key}: cannot be subscribed to: {error}") from error
         if joint is not None:
             self._joint(joint)
 

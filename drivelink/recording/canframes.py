@@ -14,7 +14,7 @@ from drivelink._core import SYNC_COB_ID, json_frame
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.syncclock import measure_period
-from drivelink.errors import DriveError, RecordingError
+from drivelink.errors import DriveError, RecordingError, raised_as
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, LoggedFrame, in_order, logged, read_frames
 from drivelink.recording.columns import record_of_samples
@@ -103,10 +103,8 @@ class FrameLog:
             self._head, self._frames = [], frames()
         self._check_complete()
         self.period_s = self._period(syncs, joint.bus.period_s)  # the communication cycle, from its SYNCs
-        try:
+        with raised_as(RecordingError, str(path), DriveError):
             self._assembly = Assembly(joint.timed(self.period_s), self._listener)
-        except DriveError as error:
-            raise RecordingError(f"{path}: {error}") from error
 
     def cycles(self) -> Iterator[Cycle]:
         """Yield the cycles of the frames; to be iterated once.

@@ -16,7 +16,7 @@ from typing import IO, Any, NamedTuple
 
 import can
 
-from drivelink.errors import RecordingError
+from drivelink.errors import RecordingError, raised_as
 from drivelink.files import open_regular
 from drivelink.recording.blf import Frame, blf_frames
 from drivelink.recording.limits import (
@@ -163,13 +163,10 @@ def _same_channel(name: str, wanted: str) -> bool:
 
 
 def _text_frames(path: Path) -> Iterator[LoggedFrame]:
-    try:
-        with open_regular(path) as file:
-            frames = _parsed(file, path)
-            first = list(islice(frames, _LOOK_AHEAD))
-            yield from _dated(first, chain(first, frames), path)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    with raised_as(RecordingError, f"{path}: cannot be read"), open_regular(path) as file:
+        frames = _parsed(file, path)
+        first = list(islice(frames, _LOOK_AHEAD))
+        yield from _dated(first, chain(first, frames), path)
 
 
 def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:

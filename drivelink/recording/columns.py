@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivelink.errors import RecordingError, UsageError
+from drivelink.errors import RecordingError, UsageError, raised_as
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.columns import COLUMNS, OF_LINK, OF_MOTOR, si_factor, suits
 from drivelink.plaintext import some
@@ -64,10 +64,8 @@ def parse_column_map(texts: Sequence[str]) -> ColumnMap:
             )
         if name in found:
             raise UsageError(f"names: {name} is given twice, as {found[name].column[:80]} and {source[:80]}")
-        try:
+        with raised_as(UsageError, f"names: {name}", ValueError):
             found[name] = Source(source.strip(), si_factor(name, unit), unit=unit)
-        except ValueError as error:
-            raise UsageError(f"names: {name}: {error}") from error
     return found
 
 
@@ -219,7 +217,7 @@ def record_from_columns(
     report_gaps(sequence, grid.period_s, where)
     if not keep_nan:  # use tick by tick does not allocate the gaps
         require_samples(int(sequence[-1]) + 1, where)
-    try:
+    with raised_as(RecordingError, where, EstimatorError):
         return Record(
             period_s=grid.period_s,
             sequence=sequence,
@@ -229,8 +227,6 @@ def record_from_columns(
             start_s=grid.start_s,
             **{name: values[rows] for name, values in link.items()},
         )
-    except EstimatorError as error:
-        raise RecordingError(f"{where}: {error}") from error
 
 
 def _on_grid(

@@ -13,7 +13,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from drivelink.errors import RecordingError
+from drivelink.errors import RecordingError, raised_as
 from drivelink.files import open_regular
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.columns import COLUMNS
@@ -45,15 +45,12 @@ def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray
         RecordingError: no header, a cell that is not a number, a line with another number of columns, or too
             many lines or columns.
     """
-    try:
-        with open_regular(path) as file:
-            layout, rows = _opened(file, path, names)
-            values, count = array("d"), 0
-            for count, row in enumerate(rows, start=1):
-                require_samples(count, str(path))
-                values.extend(row)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    with raised_as(RecordingError, f"{path}: cannot be read"), open_regular(path) as file:
+        layout, rows = _opened(file, path, names)
+        values, count = array("d"), 0
+        for count, row in enumerate(rows, start=1):
+            require_samples(count, str(path))
+            values.extend(row)
     if not count:
         raise RecordingError(f"{path}: expected samples below the header, got none")
     table = np.frombuffer(values).reshape(count, -1)

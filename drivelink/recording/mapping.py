@@ -5,6 +5,7 @@ An MCAP file carries both; other formats get a file beside them: `r.log` has `r.
 
 import json
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from drivelink.canopen.layout import (
     layout_document,
     layout_from,
 )
-from drivelink.errors import RecordingError, UsageError
+from drivelink.errors import RecordingError, UsageError, raised_as
 from drivelink.files import read_regular
 from drivelink.jointfile import JointFile, JointText, ZenohSection
 from drivelink.recording.canlog import CAN_SUFFIXES
@@ -75,15 +76,13 @@ def recorded_layouts(path: Path, joint: str, *, daemon: bool, begun: bool = Fals
     Raises:
         RecordingError: the mapping is damaged.
     """
-    try:
+    with raised_as(RecordingError, f"{path}: its mapping cannot be read", ValueError):
         if path.suffix.lower() != ".mcap":
             side = _read_side(path)
             return layouts_from(side, joint, daemon=daemon) if side else ()
         for message in read_messages(path, frozenset({"mapping"} if begun else {"mapping", "model"})):
             if layouts := layouts_from(message.data, joint, daemon=daemon):
                 return layouts
-    except ValueError as error:
-        raise RecordingError(f"{path}: its mapping cannot be read: {error}") from error
     return ()
 
 
@@ -131,12 +130,9 @@ def contained(joint: JointFile) -> JointFile:
 
 def _read_side(path: Path) -> bytes | None:
     side = side_file(path)
-    try:
+    with raised_as(RecordingError, f"{side}: cannot be read"), suppress(FileNotFoundError):
         return read_regular(side, MAX_BYTES)
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise RecordingError(f"{side}: cannot be read: {error.strerror}") from error
+    return None
 
 
 _UNITS = {

@@ -23,7 +23,7 @@ import numpy as np
 import zstandard
 
 from drivelink._core import JsonNumbers, McapMessage, McapMessages
-from drivelink.errors import RecordingError
+from drivelink.errors import RecordingError, raised_as
 from drivelink.files import open_regular
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.columns import COLUMNS
@@ -103,13 +103,10 @@ def read_attachment(path: Path, name: str) -> bytes | None:
 @contextmanager
 def _opened(path: Path) -> Iterator[IO[bytes]]:
     """The file behind its first bytes."""
-    try:
-        with open_regular(path) as file:
-            if file.read(len(_MAGIC)) != _MAGIC:
-                raise RecordingError(f"{path}: expected an MCAP file, its first bytes are not those of one")
-            yield file
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    with raised_as(RecordingError, f"{path}: cannot be read"), open_regular(path) as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise RecordingError(f"{path}: expected an MCAP file, its first bytes are not those of one")
+        yield file
 
 
 def _records(file: IO[bytes], path: Path, wanted: frozenset[int]) -> Iterator[tuple[int, bytes]]:

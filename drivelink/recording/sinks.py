@@ -14,7 +14,7 @@ from typing import Any
 import can
 from mcap.writer import CompressionType, IndexType, Writer
 
-from drivelink.errors import RecordingError
+from drivelink.errors import RecordingError, raised_as
 from drivelink.files import NewFile, check_target, write_whole
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
@@ -57,10 +57,8 @@ class SafeFile(io.BufferedIOBase):
         self._pending = bytearray()
         self._place: int | None = None  # position of a write before the end
         self._size = 0
-        try:
+        with raised_as(RecordingError, f"{path}: cannot be written"):
             self._file = NewFile(path, force=force)
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 
     def writable(self) -> bool:
         """Return always."""
@@ -362,7 +360,5 @@ class CanSink(Sink):
     def _write_beside(self) -> None:
         text, self._beside = self._beside, ""
         if text:
-            try:
+            with raised_as(RecordingError, f"{self._side}: cannot be written"):
                 write_whole(self._side, text, force=self._force)
-            except OSError as error:
-                raise RecordingError(f"{self._side}: cannot be written: {error.strerror}") from error

@@ -82,7 +82,6 @@ Found = dict[str, float] | str  # the figures, or what a change breaks
 
 
 def cases(seeds: int) -> Iterator[Case]:
-    """Recordings to diagnose."""
     for names in EFFECTS:
         for seed in range(SEED, SEED + seeds):
             declared, real = joint_of(names, seed)

@@ -159,7 +159,6 @@ def pushes(scale: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def simulate(joint: JointFile, seconds: float, seed: int, pushed: bool) -> Motion:
-    """Run the world."""
     n, world = round(seconds / T), world_from_joint(joint, seed=seed)
     if pushed:
         assert joint.link.dynamics is not None and world.excitation is not None
@@ -267,7 +266,6 @@ def judge(g: float, estimated: np.ndarray, contact: np.ndarray, seed: int) -> di
 
 
 def measure(name: str, minutes: float, errors: list[float], seed: int = 1) -> list[dict[str, Any]]:
-    """The rows of one joint."""
     title, text = RIGS[name]
     joint = parse(text)
     assert joint.link.dynamics is not None
@@ -300,7 +298,6 @@ def measure(name: str, minutes: float, errors: list[float], seed: int = 1) -> li
 
 
 def rows(args) -> Iterator[scene.Row]:
-    """The rows of all joints."""
     errors = [float(text) for text in args.errors]
     with ProcessPoolExecutor(args.jobs) as pool:
         for run in [pool.submit(measure, name, args.minutes, errors) for name in args.joints]:

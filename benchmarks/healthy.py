@@ -55,7 +55,6 @@ def joint(rng: np.random.Generator) -> tuple[dict[str, float | str], JointModel]
 
 
 def motion(rng: np.random.Generator, kind: str, stiffness: float) -> dict[str, float | str]:
-    """Settings of one motion."""
     size = 0.6 if kind == "point-to-point" else 0.05 * stiffness
     return {
         "motion": kind,
@@ -67,7 +66,6 @@ def motion(rng: np.random.Generator, kind: str, stiffness: float) -> dict[str, f
 
 
 def rows(args) -> Iterator[scene.Row]:
-    """One row a joint."""
     for seed in range(args.first, args.first + args.seeds):
         rng = np.random.default_rng([seed, 7])
         settings, model = joint(rng)
@@ -99,7 +97,6 @@ def rows(args) -> Iterator[scene.Row]:
 
 
 def counted(found: list[scene.Row]) -> str:
-    """How many have findings."""
     verdicts = [row["verdict"] for row in found]
     each = ", ".join(f"{verdicts.count(one)} {one}" for one in dict.fromkeys(verdicts))
     return f"of {len(found)} healthy second recordings: {each}"

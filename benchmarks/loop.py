@@ -146,7 +146,6 @@ def shown(one: scene.Row) -> scene.Row:
 
 
 def total(made: list[scene.Row]) -> str:
-    """All effects together."""
     alarmed = sum(one["alarm_s"] is not None for one in made)
     proposed = [one for one in made if one["state"] == finding.PROPOSED]
     quiet = sum(not one["alarm_after"] for one in proposed)

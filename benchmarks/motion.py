@@ -77,7 +77,6 @@ class Joint(NamedTuple):
 
 
 def joint_of(case: Case, seed: int) -> Joint:
-    """A random joint with this effect."""
     rng = np.random.default_rng(seed)
     own = {k: rng.uniform(*v) if isinstance(v, tuple) else v for k, v in case.settings.items()}
     settings = {
@@ -170,7 +169,6 @@ def rows(args) -> Iterator[scene.Row]:
 
 
 def total(made: list[scene.Row]) -> str:
-    """All recordings together."""
     kinds = [f"{label}_{kind}" for label in ("designed", "random") for kind in ("decides", "sure")]
     best, surely, random, random_surely = (sum(one[kind] for one in made) for kind in kinds)
     unlisted = [one for one in made if not one["rival"]]

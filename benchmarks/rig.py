@@ -79,7 +79,6 @@ class Devices:
         self._begin: tuple[int, float] | None = None
 
     def poll(self) -> None:
-        """Let them answer."""
         start = time.thread_time()
         self.network.poll()
         if self._begin is None and self.network.syncs:
@@ -110,6 +109,5 @@ class AnsweringBus(VirtualBus):
         self._devices = devices
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """See can.BusABC."""
         super().send(msg, timeout)
         self._devices.poll()

@@ -110,7 +110,6 @@ def run(name: str, quick: bool) -> str:
 
 
 def main() -> None:
-    """Run what is asked for, and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     names = list(SECTIONS)
     parser.add_argument("--quick", action="store_true", help="small sizes: minutes instead of hours")

@@ -253,7 +253,6 @@ def _thirds(values: FloatArray) -> list[int]:
 
 
 def rows(args: argparse.Namespace) -> Iterator[scene.Row]:
-    """One row."""
     logging.getLogger("drivelink").setLevel(logging.CRITICAL)
     sys.setswitchinterval(0.0005)  # the bookkeeping here must not hold the daemon's thread up for long
     soak = Soak(args)

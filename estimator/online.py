@@ -97,35 +97,28 @@ class _Compiled:
 
     @property
     def residual_nm(self) -> float:
-        """See `Estimator`."""
         return self.core.residual_nm
 
     @property
     def flexibility_torque_std_nm(self) -> float:
-        """See `Estimator`."""
         return self.core.flexibility_torque_std_nm
 
     @property
     def external(self) -> External | None:
-        """See `Estimator`."""
         return self.core.external
 
     @property
     def consistency(self) -> Consistency | None:
-        """See `Estimator`."""
         result = self.core.consistency
         return None if result is None else Consistency(*result)
 
     def parameters(self) -> list[dict[str, Any]]:
-        """See `Estimator`."""
         return [self._named(i, motor) for i, motor in enumerate(self._model.motors)]
 
     def undeclared(self) -> list[list[str]]:
-        """See `Estimator`."""
         return [self.core.undeclared(i) for i in range(len(self._model.motors))]
 
     def friction(self) -> list[dict[str, float] | None]:
-        """See `Estimator`."""
         return [self._friction(i, motor) for i, motor in enumerate(self._model.motors)]
 
     def _friction(self, i: int, motor: Motor) -> dict[str, float] | None:
@@ -141,7 +134,6 @@ class _Compiled:
         return {"torque_nm": declared + found[0], "std_nm": found[1]}
 
     def why(self) -> tuple[str, str] | None:
-        """See `Estimator`."""
         why = self.core.why()
         if why is None:
             return None
@@ -150,7 +142,6 @@ class _Compiled:
         return name, reason_text(name, motor=motor, share=share, asked=self._asked, changes=changes)
 
     def suspicion(self) -> dict[str, Any] | None:
-        """See `Estimator`."""
         suspicion = self.core.suspicion()
         if suspicion is None:
             return None

@@ -100,8 +100,6 @@ def sheet_objects(sheet: DataSheet, node: int) -> Objects:
 
 @dataclass
 class Slave:
-    """One node."""
-
     node: int
     objects: Objects
     refuse: dict[tuple[int, int], int] = field(default_factory=dict)

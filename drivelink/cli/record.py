@@ -207,7 +207,6 @@ class _Summary:
         self._next = self._begin + _SAY_EVERY_S
 
     def document(self) -> dict[str, Any]:
-        """Return recorded counts as a JSON document."""
         return {
             "file": str(self._path),
             "seconds": round(time.monotonic() - self._begin, 3),
@@ -217,7 +216,6 @@ class _Summary:
         }
 
     def text(self) -> str:
-        """Return recorded counts as text."""
         counts = [f"{n} {_PLURAL[kind]}" for kind, n in self._recorder.sink.counts.items() if n]
         lost = "".join(f", {n} cycles without {kind}" for kind, n in self._missed().items() if n)
         taps = [tap for tap in self._recorder.taps if isinstance(tap, ZenohTap)]

@@ -265,7 +265,6 @@ class _Handler(BaseHTTPRequestHandler):
     sys_version = ""
 
     def do_GET(self) -> None:
-        """Answer a request."""
         host, origin = self.headers.get("Host") or "", self.headers.get("Origin")
         if host.rsplit(":", 1)[0] not in _LOCAL_HOSTS or origin not in (None, f"http://{host}"):
             self.send_error(HTTPStatus.FORBIDDEN)

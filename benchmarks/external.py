@@ -25,9 +25,9 @@ share of the free motion in which the torque is valid.
 import math
 import os
 import statistics
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ import scene
 
 from drivelink.demo.simulate import world_from_joint
 from drivelink.jointfile import JointFile, parse
-from estimator import Effect, EstimatorSettings, ExternalStatus, JointModel, Sample, make_estimator
+from estimator import Effect, EstimatorSettings, ExternalStatus, JointModel, Record, make_estimator
 from estimator.filters import StateVariableFilter
 from sim.plant import MotorPlant
 
@@ -140,16 +140,6 @@ def _too_low(effect: Effect) -> Effect:
     return replace(effect, parameters=scaled | {"smoothing_rad_s": 0.01})
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """What the sensors read: (n, motors) positions and torques at the joint, (n,) link; its springs."""
-
-    theta: np.ndarray
-    tau: np.ndarray
-    q: np.ndarray
-    motors: tuple[MotorPlant, ...]
-
-
 def pushes(scale: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Begin (s) and size (N·m) of each push, in an order of its own."""
     rng = np.random.default_rng(seed)
@@ -158,7 +148,7 @@ def pushes(scale: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return np.round(begins / T) * T, sizes
 
 
-def simulate(joint: JointFile, seconds: float, seed: int, pushed: bool) -> Motion:
+def simulate(joint: JointFile, seconds: float, seed: int, pushed: bool) -> Record:
     n, world = round(seconds / T), world_from_joint(joint, seed=seed)
     if pushed:
         assert joint.link.dynamics is not None and world.excitation is not None
@@ -179,17 +169,15 @@ def simulate(joint: JointFile, seconds: float, seed: int, pushed: bool) -> Motio
             theta[k, i] = signals.position_counts / drive.counts_per_rad
             tau[k, i] = signals.current_a * drive.joint_torque_per_ampere
         q[k] = world.link_counts() / world.encoder.counts_per_rad
-    return Motion(theta, tau, q, world.plant.motors)
+    return scene.joints.recorded(theta, tau, q, T)
 
 
-def ours(model: JointModel, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def ours(model: JointModel, motion: Record) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """drivelink's external torque, whether it is valid, and its contact bit."""
     estimator = make_estimator(model, EstimatorSettings(contact_torque_nm=0.0), T)
-    nothing = (math.nan,) * motion.theta.shape[1]
-    torque, status = np.empty(len(motion.q)), np.zeros(len(motion.q), dtype=np.int64)
-    rows = zip(motion.theta.tolist(), motion.tau.tolist(), motion.q.tolist(), strict=True)
-    for k, (theta, tau, q) in enumerate(rows):
-        estimator.step(Sample(k, tuple(theta), nothing, tuple(tau), q))
+    torque, status = np.empty(len(motion)), np.zeros(len(motion), dtype=np.int64)
+    for k, sample in enumerate(motion.samples()):
+        estimator.step(sample)
         estimated = estimator.external
         assert estimated is not None
         torque[k], status[k] = estimated.external_torque_nm, estimated.status
@@ -206,13 +194,13 @@ def link_side(model: JointModel, q: np.ndarray) -> np.ndarray:
     return link.inertia_kg_m2 * acceleration + link.viscous_damping_nm_s_rad * rate + gravity
 
 
-def rigid(model: JointModel, motion: Motion, compensated: bool) -> np.ndarray:
+def rigid(model: JointModel, motion: Record, compensated: bool) -> np.ndarray:
     """The momentum observer of a rigid joint: motor and link are one body where the motor is."""
     F = StateVariableFilter(3, BANDWIDTH, T)
-    total = link_side(model, motion.theta.mean(axis=1))
+    total = link_side(model, motion.motor_position_rad.mean(axis=1))
     for i, motor in enumerate(model.motors):
-        _, rate, acceleration = F.apply(motion.theta[:, i], 2)
-        (torque,) = F.apply(motion.tau[:, i], held=True)
+        _, rate, acceleration = F.apply(motion.motor_position_rad[:, i], 2)
+        (torque,) = F.apply(motion.motor_torque_nm[:, i], held=True)
         total += motor.inertia_kg_m2 * acceleration + motor.viscous_damping_nm_s_rad * rate - torque
         if compensated:
             fast = 0.02 * np.max(np.abs(rate))
@@ -223,13 +211,14 @@ def rigid(model: JointModel, motion: Motion, compensated: bool) -> np.ndarray:
     return total
 
 
-def nominal(model: JointModel, motion: Motion) -> np.ndarray:
+def nominal(model: JointModel, motion: Record, motors: Sequence[MotorPlant]) -> np.ndarray:
     """The link's momentum and a data sheet's springs."""
     F = StateVariableFilter(3, BANDWIDTH, T)
-    total = link_side(model, motion.q)
-    for i, motor in enumerate(motion.motors):
+    assert motion.link_position_rad is not None
+    total = link_side(model, motion.link_position_rad)
+    for i, motor in enumerate(motors):
         law = motor.law()
-        phi = motion.q - motion.theta[:, i]
+        phi = motion.link_position_rad - motion.motor_position_rad[:, i]
         (torque,) = F.apply(NOMINAL * np.array([law.torque(x) for x in phi.tolist()]))
         total += torque
     return total
@@ -269,7 +258,7 @@ def measure(name: str, minutes: float, errors: list[float], seed: int = 1) -> li
     title, text = RIGS[name]
     joint = parse(text)
     assert joint.link.dynamics is not None
-    g = joint.link.dynamics.gravity_nm
+    g, springs = joint.link.dynamics.gravity_nm, world_from_joint(joint).plant.motors
     free = simulate(joint, LEARN_S + 60.0 * minutes, seed, pushed=False)
     motion = simulate(joint, LEARN_S + EVERY_S * (len(LADDER) * EACH + 1), seed + 1, pushed=True)
     rows: list[dict[str, Any]] = []
@@ -288,7 +277,7 @@ def measure(name: str, minutes: float, errors: list[float], seed: int = 1) -> li
             ("drivelink, threshold", np.where(valid, torque, np.nan), pushed),
             ("rigid", rigid(model, free, False), rigid(model, motion, False)),
             ("rigid, friction", rigid(model, free, True), rigid(model, motion, True)),
-            ("nominal spring", nominal(model, free), nominal(model, motion)),
+            ("nominal spring", nominal(model, free, springs), nominal(model, motion, springs)),
         ):
             threshold = float(np.nanmax(np.abs(quiet[after])))
             methods[method] = judge(g, estimated, np.abs(estimated) > threshold, seed + 1)

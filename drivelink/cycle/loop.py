@@ -60,10 +60,6 @@ class CycleLoop:
         produce: make SYNC; else follow it.
         counter_overflow: 0x1019; 0: SYNC carries no counter.
         world_steps: only SYNC advances the (simulated) world, so a skipped SYNC is no gap.
-
-    Attributes:
-        sync_ns: monotonic time of the present SYNC.
-        received_ns: monotonic time of the last reception.
     """
 
     def __init__(
@@ -113,6 +109,7 @@ class CycleLoop:
         self._loop_joints_of: dict[int, list[LoopJoint]] = {}
         self.reroute()
         self.unix_ns = time.time_ns() - time.monotonic_ns()  # UNIX time less monotonic time
+        # monotonic times of the present SYNC and of the last reception
         self.sync_ns = self.received_ns = time.monotonic_ns()
         self.stopped = False  # `stop` was called
 

@@ -32,12 +32,7 @@ class Nmt(IntEnum):
 
 
 class Node:
-    """One device on the bus; drives and encoders derive from it and override the `on_…` hooks.
-
-    Attributes:
-        tpdos: by number from 1.
-        rpdos: by number from 1.
-    """
+    """One device on the bus; drives and encoders derive from it and override the `on_…` hooks."""
 
     # whether changed process data trigger types 254 and 255; if not, only the event timer does
     sends_on_change = True
@@ -83,6 +78,7 @@ class Node:
         self.emergency, self.sdo = Emergency(self), SdoServer(self)
         self.heartbeat, self.consumer = HeartbeatProducer(self), HeartbeatConsumer(self)
         numbers = range(1, 513)
+        # by number from 1
         self.tpdos = {n: Tpdo(self, n) for n in numbers if (0x17FF + n, 1) in self.dictionary}
         self.rpdos = {n: Rpdo(self, n) for n in numbers if (0x13FF + n, 1) in self.dictionary}
 

@@ -64,6 +64,10 @@ _ENCODER = LinkEncoder()  # 18 bit, a usual absolute encoder
 _FINE_RAD_S = 0.001 * RPM_RAD_S  # of the velocity: the finest unit that usual CiA 402 drives offer
 
 
+def _rich(**numbers: float) -> Mapping[str, Any]:
+    return {"kind": "rich", "low_hz": 0.1, **numbers}
+
+
 def _paper_joint(name: str, spring: Spring) -> Case:
     motor = MotorPlant(inertia_kg_m2=0.05, viscous_damping_nm_s_rad=0.001, spring=spring)
     link = LinkPlant(inertia_kg_m2=0.1, viscous_damping_nm_s_rad=0.0001, gravity_nm=0.025)
@@ -82,14 +86,7 @@ def _paper_joint(name: str, spring: Spring) -> Case:
         drives=(drive,),
         encoder=_ENCODER,
         excitation={"kind": "sines", "amplitude_nm": 0.01, "frequency_hz": 0.05},
-        rich={
-            "kind": "rich",
-            "amplitude_nm": 0.02,
-            "low_hz": 0.1,
-            "high_hz": 2.0,
-            "centring_nm_rad": 0.02,
-            "centring_nm_s_rad": 0.03,
-        },
+        rich=_rich(amplitude_nm=0.02, high_hz=2.0, centring_nm_rad=0.02, centring_nm_s_rad=0.03),
     )
 
 
@@ -127,14 +124,7 @@ def _vsa_ii() -> Case:
         # The printed torques lack t, and 10 N·mm does not reach the deflections that the printed polynomials
         # were fitted on; 100 N·mm does.
         excitation={"kind": "sines", "amplitude_nm": 0.1, "frequency_hz": [0.05, 0.1]},
-        rich={
-            "kind": "rich",
-            "amplitude_nm": 0.08,
-            "low_hz": 0.1,
-            "high_hz": 6.0,
-            "centring_nm_rad": 0.1,
-            "centring_nm_s_rad": 0.005,
-        },
+        rich=_rich(amplitude_nm=0.08, high_hz=6.0, centring_nm_rad=0.1, centring_nm_s_rad=0.005),
     )
 
 

@@ -3,7 +3,7 @@
 import itertools
 import math
 import sys
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -136,14 +136,11 @@ class Rig:
 @contextmanager
 def running(seconds: float = 0.5, channel: str | None = None, **settings):
     """A rig on its way between its targets for so long."""
-    rig = Rig(replace(QUICK, **settings), channel)
-    try:
+    with closing(Rig(replace(QUICK, **settings), channel)) as rig:
         assert rig.run(12.0, "run"), rig.events
         rig.run(seconds)
         assert rig.controller.phase == "run", rig.events
         yield rig
-    finally:
-        rig.close()
 
 
 def torque_ended(rig, since_s: float) -> float:

@@ -3,7 +3,7 @@
 import itertools
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -135,11 +135,8 @@ class DaemonRig:
 
 @contextmanager
 def rig(joint: JointFile | None = None, path: Path | None = None, **options: Any) -> Iterator[DaemonRig]:
-    made = DaemonRig(joint or vsa(), path, **options)
-    try:
+    with closing(DaemonRig(joint or vsa(), path, **options)) as made:
         yield made
-    finally:
-        made.close()
 
 
 @contextmanager

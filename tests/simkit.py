@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import can
@@ -97,11 +97,8 @@ class Wire:
 @contextmanager
 def wired(*nodes: Node, rig: StubRig) -> Iterator[Wire]:
     """The nodes on a wire, not yet switched on."""
-    wire = Wire(list(nodes), rig)
-    try:
+    with closing(Wire(list(nodes), rig)) as wire:
         yield wire
-    finally:
-        wire.close()
 
 
 def play(wire: Wire, transcript: Path) -> int:

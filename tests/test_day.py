@@ -5,6 +5,7 @@ import json
 import shutil
 import urllib.error
 import urllib.request
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, cast
@@ -144,20 +145,17 @@ def test_the_page_links_events_to_recording_and_diagnosis(tmp_path, monkeypatch)
 def test_the_page_of_a_short_day_can_be_read_on_a_phone(tmp_path):
     Written(tmp_path).run(200)
     kept_one(tmp_path)
-    web = WebView(cast(Any, None), day=WebDay(tmp_path, "elbow"))
-    try:
-        with chromium.Chromium(tmp_path / "profile") as browser:
-            browser.resize(375, 700)
-            browser.open(web.url + "day")
-            browser.wait_for("document.querySelector('#events td') !== null")
-            assert browser.evaluate("Math.max(...[...$('events').rows].map(row => row.scrollWidth))") <= 375
-            last = browser.evaluate(
-                "$('events').querySelector('td:last-child').getBoundingClientRect().width"
-            )
-            assert last > 250  # what was found has a line of its own
-            assert browser.evaluate("document.querySelector('[aria-pressed=true]').textContent") == "10 min"
-            assert browser.evaluate("text(5e-7, 5e-7)") == "5e−7"
-            assert "grey: not valid, red: event" in browser.evaluate(SAID)
-            assert browser.evaluate("$('friction').shown.high") > 0.3 + 1.96 * 0.01  # its band is in the plot
-    finally:
-        web.close()
+    with (
+        closing(WebView(cast(Any, None), day=WebDay(tmp_path, "elbow"))) as web,
+        chromium.Chromium(tmp_path / "profile") as browser,
+    ):
+        browser.resize(375, 700)
+        browser.open(web.url + "day")
+        browser.wait_for("document.querySelector('#events td') !== null")
+        assert browser.evaluate("Math.max(...[...$('events').rows].map(row => row.scrollWidth))") <= 375
+        last = browser.evaluate("$('events').querySelector('td:last-child').getBoundingClientRect().width")
+        assert last > 250  # what was found has a line of its own
+        assert browser.evaluate("document.querySelector('[aria-pressed=true]').textContent") == "10 min"
+        assert browser.evaluate("text(5e-7, 5e-7)") == "5e−7"
+        assert "grey: not valid, red: event" in browser.evaluate(SAID)
+        assert browser.evaluate("$('friction').shown.high") > 0.3 + 1.96 * 0.01  # its band is in the plot

@@ -6,7 +6,7 @@ import socket
 import threading
 import time
 import tty
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -103,22 +103,18 @@ def lost(daemon: Daemon) -> bool:
 def test_a_joint_behind_a_serial_adapter_that_is_pulled_out_and_put_in(tmp_path):
     behind = vsa(bus=f"period_s = {PERIOD_S}")
     joint = joint_on("slcan", str(tmp_path / "ttyCAN"), "sleep_after_open = 0.0")
-    adapter = SerialAdapter(tmp_path / "ttyCAN", behind.bus.channel)
-    try:
-        with served(behind):
-            daemon = quiet_daemon(joint)
-            pipeline = daemon.pipelines[0]
-            with running(daemon):
-                until(lambda: is_fresh(pipeline))
-                adapter.pull_out()
-                until(lambda: lost(daemon))
-                until(lambda: not is_fresh(pipeline))
-                adapter.put_in()
-                until(lambda: is_fresh(pipeline))
-                assert not lost(daemon)
-            assert {"S8", "O"} <= set(adapter.commands)
-    finally:
-        adapter.close()
+    with closing(SerialAdapter(tmp_path / "ttyCAN", behind.bus.channel)) as adapter, served(behind):
+        daemon = quiet_daemon(joint)
+        pipeline = daemon.pipelines[0]
+        with running(daemon):
+            until(lambda: is_fresh(pipeline))
+            adapter.pull_out()
+            until(lambda: lost(daemon))
+            until(lambda: not is_fresh(pipeline))
+            adapter.put_in()
+            until(lambda: is_fresh(pipeline))
+            assert not lost(daemon)
+        assert {"S8", "O"} <= set(adapter.commands)
 
 
 def test_a_passive_serial_adapter_is_opened_listen_only_at_its_bit_rate(tmp_path):

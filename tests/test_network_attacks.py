@@ -83,12 +83,9 @@ ESTIMATES = {
 @contextmanager
 def rogue(endpoint):
     """A session like a daemon's: it listens, so that everybody connects to it."""
-    session = zenoh.open(daemon_config(endpoint, listen=False))
-    try:
+    with zenoh.open(daemon_config(endpoint, listen=False)) as session:
         until(lambda: session.info.peers_zid())
         yield session
-    finally:
-        session.close()
 
 
 def publish(publisher, sequence=[0]):  # noqa: B006  (counts through the test)

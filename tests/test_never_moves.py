@@ -5,6 +5,7 @@ What is allowed is written down here once more, from CiA 301 and not from `drive
 
 import threading
 import time
+from contextlib import closing
 
 import pytest
 from can.interfaces.virtual import VirtualBus
@@ -69,16 +70,12 @@ def lives(made):
 @pytest.mark.parametrize("profile", ["elmo", pytest.param("nanotec", marks=pytest.mark.slow)])
 def test_through_boot_run_reboot_and_configuration_no_frame_could_move_a_drive(profile):
     joint = parse(vsa_text() + f'quirks = "{profile}"\n')
-    listener = Listener(joint)
-    try:
-        with rig(joint) as made:
-            # A second TPDO number could share an identifier with these, and then this test would see nothing.
-            tpdos = {t.cob_id for layout in made.daemon.layouts.values() for t in layout.tpdos}
-            lives(made)
-            sent = [f for f in listener.frames() if f[0] in OURS - tpdos]
-            states = {made.status["nodes"][str(node)]["drive_state"] for node in (1, 2)}
-    finally:
-        listener.close()
+    with closing(Listener(joint)) as listener, rig(joint) as made:
+        # A second TPDO number could share an identifier with these, and then this test would see nothing.
+        tpdos = {t.cob_id for layout in made.daemon.layouts.values() for t in layout.tpdos}
+        lives(made)
+        sent = [f for f in listener.frames() if f[0] in OURS - tpdos]
+        states = {made.status["nodes"][str(node)]["drive_state"] for node in (1, 2)}
     writes = [frame for frame in sent if 0x600 < frame[0] < 0x680 and frame[1][0] >> 5 == 1]
     assert len(writes) > 50  # it was configured, and more than once
     assert states == {"switch on disabled"}  # as the drives boot

@@ -16,8 +16,8 @@ from estimator import (
     fit,
     make_estimator,
     register_table,
+    transmissions,
 )
-from estimator.transmissions import MODELS
 
 T = 1e-3
 N = 3
@@ -119,25 +119,23 @@ def test_a_fitted_spring_is_not_left_for_a_wrong_one():
         assert np.mean(estimates.valid[4000:]) > 0.99
 
 
-def test_a_measured_curve_is_a_model_too():
+def test_a_measured_curve_is_a_model_too(monkeypatch):
     """A table of tau_e, declared; the spring is 15 % stiffer than it was measured."""
     name = "table-for-test"
+    monkeypatch.setattr(transmissions, "MODELS", dict(transmissions.MODELS))
     phi = np.linspace(0.02, 0.8, 40)
     register_table(name, phi, 100.0 * phi + 400.0 * phi**3)
-    try:
-        rng = np.random.default_rng(4)
-        n = 6000
-        alpha = 1.15 * np.array([[[100.0, 400.0]]])
-        plants = joints.Plants(*joints.polynomial(alpha), 0.12, 0.8, 0.45, 0.3, 3.0)
-        truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, 7.0, 3.0), T)
-        record = joints.record(truth, 0, T, motor_counts=16384, link_bits=18, velocity_rad_s=None)
-        model = joints.joint_model(0.12, 0.8, model=name, parameters={"k_nm_rad": 1.0})
-        estimator = make_estimator(model, EstimatorSettings(), T)
-        out = np.array([estimator.step(sample)[:5] for sample in record.samples()])
-        late = slice(3000, None)
-        # A cubic between points of the table is good to a few parts in ten thousand.
-        assert out[late, 3] == pytest.approx(truth.sigma[late, 0, 0], rel=5e-3)
-        assert np.mean(has(out, Status.VALID)[late]) > 0.95
-        assert estimator.parameters()[0]["parameters"]["k_nm_rad"] == pytest.approx(1.15, rel=2e-3)
-    finally:
-        del MODELS[name]
+    rng = np.random.default_rng(4)
+    n = 6000
+    alpha = 1.15 * np.array([[[100.0, 400.0]]])
+    plants = joints.Plants(*joints.polynomial(alpha), 0.12, 0.8, 0.45, 0.3, 3.0)
+    truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, 7.0, 3.0), T)
+    record = joints.record(truth, 0, T, motor_counts=16384, link_bits=18, velocity_rad_s=None)
+    model = joints.joint_model(0.12, 0.8, model=name, parameters={"k_nm_rad": 1.0})
+    estimator = make_estimator(model, EstimatorSettings(), T)
+    out = np.array([estimator.step(sample)[:5] for sample in record.samples()])
+    late = slice(3000, None)
+    # A cubic between points of the table is good to a few parts in ten thousand.
+    assert out[late, 3] == pytest.approx(truth.sigma[late, 0, 0], rel=5e-3)
+    assert np.mean(has(out, Status.VALID)[late]) > 0.95
+    assert estimator.parameters()[0]["parameters"]["k_nm_rad"] == pytest.approx(1.15, rel=2e-3)

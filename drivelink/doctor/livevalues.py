@@ -246,8 +246,7 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[Reader]:
         BusError: the bus cannot be opened.
         DriveError: a node does not answer, or its frames give no samples.
     """
-    bus = open_bus(joint.bus)
-    try:
+    with open_bus(joint.bus) as bus:
         if joint.bus.configure:
             mine = roles(joint, base_dir)
             asked = Asked(
@@ -265,5 +264,3 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[Reader]:
             if not heard.listen(silent, _PATIENCE_S):
                 raise DriveError(f"{joint.name}: no sample in {_PATIENCE_S:g} s: {heard.missing}")
             yield lambda seconds: values_of(heard.listen(silent, seconds))
-    finally:
-        bus.shutdown()

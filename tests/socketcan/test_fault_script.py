@@ -1,5 +1,7 @@
 """The fault script on a real SocketCAN: daemon, devices and a third party on vcan1, in real time."""
 
+from contextlib import closing
+
 import pytest
 from daemonkit import vsa
 from faultscript import SCRIPT
@@ -16,12 +18,9 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def stage():
-    made = RealStage(vsa(channel=CHANNEL, bus='interface = "socketcan"\nperiod_s = 0.01'))
-    try:
+    with closing(RealStage(vsa(channel=CHANNEL, bus='interface = "socketcan"\nperiod_s = 0.01'))) as made:
         made.settle()
         yield made
-    finally:
-        made.close()
 
 
 @pytest.mark.parametrize("fault", [f for f in SCRIPT if f.where != "lockstep"], ids=lambda fault: fault.name)

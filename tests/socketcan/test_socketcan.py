@@ -29,13 +29,10 @@ def ip(*arguments):
 
 @contextmanager
 def source(channel=CHANNEL):
-    bus = open_bus(BusSection(interface="socketcan", channel=channel))
-    try:
+    with open_bus(BusSection(interface="socketcan", channel=channel)) as bus:
         opened = open_source(bus)
         assert isinstance(opened, SocketCanSource)
         yield opened
-    finally:
-        bus.shutdown()
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 import itertools
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -366,15 +367,14 @@ def test_nodes_that_do_not_answer_what_is_asked_get_a_limited_time_and_what_was_
     monkeypatch, tmp_path, capsys
 ):
     wire = Wire([Babbler(node, drive_objects(node)) for node in range(1, 128)])
-    wire.shutdown = lambda: None
     monkeypatch.setattr(scanning, "ASKED_S", 0.2)
-    monkeypatch.setattr(nodes, "open_bus", lambda _: wire)
+    monkeypatch.setattr(nodes, "open_bus", lambda _: nullcontext(wire))
     report = Report()
     nodes.examine_bus(report, parse(joint_on("babble")), Path(), 0.1)
     said = " ".join(texts(report))
     assert said.count("was not asked further: the time for it is over") == 2  # ours
     assert "125 more: not in the joint file, not asked for want of time: node 1," in said
-    monkeypatch.setattr(cli_new, "open_bus", lambda _: wire)
+    monkeypatch.setattr(cli_new, "open_bus", lambda _: nullcontext(wire))
     path = str(tmp_path / "elbow.toml")
     assert main(["new", path, "--scan"]) == 5
     assert "127 nodes answer, 127 of them were not asked" in capsys.readouterr().err

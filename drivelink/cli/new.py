@@ -185,12 +185,9 @@ def _scanned(answers: Answers) -> Answers:
     if answers.passive:
         raise UsageError("--scan asks the nodes, --passive forbids it: give --node instead")
     section = BusSection(interface=answers.interface, channel=answers.channel, bitrate=answers.bitrate)
-    bus = open_bus(section)
-    try:
+    with open_bus(section) as bus:
         ids, _ = scan(bus)
         found, left = identify_all(bus, section, ids, next(shares(1)))
-    finally:
-        bus.shutdown()
     if left:
         raise DriveError(
             f"{section.channel}: {len(ids)} nodes answer, {len(left)} of them were not asked what they are "

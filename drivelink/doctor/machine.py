@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.realtime import PRIORITY
 from drivelink.doctor.report import Section
@@ -96,7 +98,7 @@ def _timer(section: Section, period_s: float, seconds: float) -> None:
         now = time.monotonic_ns()
         late_us.append((now - deadline) / 1000)
         deadline += period_ns * max(1, (now - deadline) // period_ns + 1)
-    p50, p99, worst = percentile(late_us, 0.5), percentile(late_us, 0.99), max(late_us)
+    p50, p99, worst = np.quantile(late_us, (0.5, 0.99, 1.0), method="higher").tolist()
     section.facts["timer_late_us"] = {"p50": p50, "p99": p99, "max": worst}
     text = f"wakes {p50:.0f}/{p99:.0f}/{worst:.0f} µs late (p50/p99/max of {len(late_us)}, no real time)"
     if worst >= period_s * 1e6 or p99 >= _BAD_JITTER_US:
@@ -109,12 +111,6 @@ def _timer(section: Section, period_s: float, seconds: float) -> None:
         section.ok("timer", text)
     else:
         section.info("timer", text)
-
-
-def percentile(values: list[float], fraction: float) -> float:
-    """Return the given quantile of the values."""
-    ordered = sorted(values)
-    return ordered[min(len(ordered) - 1, int(fraction * len(ordered)))]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,9 +136,9 @@ def judge_sync(
             section.ok("SYNC", "not produced yet: drivelink run will produce it")
         return
     gaps = [after - before for before, after in itertools.pairwise(stamps_s)]
-    period_s = percentile(gaps, 0.5)
+    period_s = float(np.quantile(gaps, 0.5, method="higher"))
     deviation_us = [abs(gap - period_s) * 1e6 for gap in gaps]
-    p99, worst = percentile(deviation_us, 0.99), max(deviation_us)
+    p99, worst = float(np.quantile(deviation_us, 0.99, method="higher")), max(deviation_us)
     section.facts["sync"] = {"period_s": period_s, "jitter_us": {"p99": p99, "max": worst}}
     text = f"every {period_s * 1000:.3f} ms, jitter {p99:.0f} µs (p99), {worst:.0f} µs (max)"
     if bus.sync == "produce":

@@ -55,19 +55,13 @@ def examine_bus(
     section = report.section("Bus")
     daemons = Daemons(ours=joint.name in served, others=[name for name in served if name != joint.name])
     try:
-        bus = open_bus(joint.bus)
-    except BusError as error:
-        section.error(joint.bus.channel, str(error))
-        return
-    try:
-        if joint.bus.configure:
-            _ask(report, section, bus, joint, base_dir, seconds, daemons)
-        else:
-            _overhear(report, section, SilentBus(bus), joint, base_dir, seconds, daemons)
+        with open_bus(joint.bus) as bus:
+            if joint.bus.configure:
+                _ask(report, section, bus, joint, base_dir, seconds, daemons)
+            else:
+                _overhear(report, section, SilentBus(bus), joint, base_dir, seconds, daemons)
     except (BusError, DriveError, JointFileError) as error:
         section.error(joint.bus.channel, str(error))
-    finally:
-        bus.shutdown()
 
 
 def _ask(

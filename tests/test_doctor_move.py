@@ -162,6 +162,14 @@ def test_what_was_not_seen_is_not_ticked():
     assert done.paste == []
 
 
+def test_a_joint_that_does_not_rest_is_told_to_and_nothing_is_said_of_its_scale():
+    rig = HandMovedJoint({"link_position": 0.2})
+    rig.std = 0.05  # its controller moves it
+    done = check_by_hand(joint(), rig.read, rig)
+    assert not any(mark.good is not None for mark in done.marks if "position" in mark.channel)
+    assert done.paste == [] and any("was not at rest" in said for said in rig.said)
+
+
 def test_of_two_motors_each_torque_has_its_own_gear_and_what_is_not_read_is_not_judged():
     def pushed(wrong: dict[str, float], unread: str = "") -> ByHand:
         rig = HandMovedJoint(wrong, {"Push": "3.0"})

@@ -19,7 +19,7 @@ _STILL = 0.1  # of the requested motion: a channel that moves less did not follo
 _BY_EYE = 0.15  # relative accuracy of an angle turned by eye
 _FRICTION = 2.0  # factor: uncertainty of a torque by friction in the gear and a push by hand
 _GEARED = 3.0  # ratios closer to one than this are a scale error, not a gear
-_SIGMAS = 5.0  # standard deviations of a difference of two torques that a push has to exceed
+_SIGMAS = 5.0  # standard deviations of a difference of two readings that is believed
 _AMOUNT = re.compile(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(\D*)", re.ASCII)  # number, unit
 
 
@@ -176,16 +176,19 @@ class _Steps:
         after = self._now()
         for channel in channels:
             if channel in before and channel in after:
-                self._position(channel, after[channel].mean - before[channel].mean, asked)
+                self._position(channel, before[channel], after[channel], asked)
             else:
                 self._mark(channel, "sign", None, "not read")
 
-    def _position(self, channel: str, moved: float, asked: float) -> None:
-        shown = self._axis.shown
+    def _position(self, channel: str, before: Value, after: Value, asked: float) -> None:
+        shown, moved = self._axis.shown, after.mean - before.mean
         seen, ratio = f"{shown(moved)} for {shown(asked)}", abs(moved / asked)
         geared = channel != "link_position" and self._is_gear(ratio, int(channel[5]) - 1)
         if ratio < _STILL and not geared:
             self._mark(channel, "sign", None, f"did not follow ({seen}): jog it, or check its cable")
+            return
+        if _SIGMAS * math.hypot(before.std, after.std) > _BY_EYE * abs(moved):
+            self._mark(channel, "sign", None, f"was not at rest ({seen}): end what moves it, hold it still")
             return
         positive = moved * asked > 0.0
         text = "positive" if positive else "negative: it counts backwards"

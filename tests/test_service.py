@@ -105,6 +105,8 @@ def test_a_home_installation_is_let_in_and_keys_come_as_credentials(monkeypatch)
     assert "LoadCredential=daemon.key:/etc/ssl/private/daemon.key" in unit
     assert "DeviceAllow=char-ttyACM rw" in unit and "PrivateDevices=yes" not in unit
     assert f"LimitNOFILE={FILES}\n" in unit
+    (unit,) = installation(parse(text("slcan", "x")), Path("/tmp/try/elbow.toml"), path).files.values()
+    assert "BindReadOnlyPaths=/tmp/try\n" in unit and "PrivateTmp=yes" in unit
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")

@@ -19,7 +19,7 @@ from drivelink.jointfile import JointFile
 
 UNITS = Path("etc/systemd/system")
 NETWORKS = Path("etc/systemd/network")
-_HOMES = (Path("/home"), Path("/root"), Path("/run/user"))
+_HIDDEN = tuple(map(Path, ("/home", "/root", "/run/user", "/tmp", "/var/tmp")))  # by ProtectHome, PrivateTmp
 _SERIAL = ("slcan", "serial", "seeedstudio", "robotell")
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _BARE = re.compile(r"[A-Za-z0-9_./:@+-]+")
@@ -68,9 +68,7 @@ def installation(
     interface, channel = joint.bus.interface, joint.bus.channel
     _check_bus(interface, channel, path)
     can, serial = interface == "socketcan", interface in _SERIAL
-    seen = [
-        f"BindReadOnlyPaths={_plain(p)}" for p in _below_home([path.parent, executable.parent, *_python()])
-    ]
+    seen = [f"BindReadOnlyPaths={_plain(p)}" for p in _hidden([path.parent, executable.parent, *_python()])]
     whose, user, kept = "A user of its own", "DynamicUser=yes", kept_in(joint, path)
     if kept is not None:  # its owner keeps, reads and accepts there
         seen.append(f"BindPaths={_plain(kept)}")
@@ -148,10 +146,10 @@ def _python() -> Iterable[Path]:
     yield Path(drivelink.__file__).resolve().parent.parent
 
 
-def _below_home(places: Iterable[Path]) -> list[Path]:
-    """Distinct paths below a home directory, none inside another."""
+def _hidden(places: Iterable[Path]) -> list[Path]:
+    """Distinct paths that the unit would not see, none inside another."""
     below = {place.resolve() for place in places} | set(places)
-    below = {place for place in below if any(home in place.parents for home in _HOMES)}
+    below = {place for place in below if any(home in place.parents for home in _HIDDEN)}
     return sorted(place for place in below if not below & set(place.parents))
 
 

@@ -214,7 +214,14 @@ class Diagnosed:
     def sections(self) -> list[Section]:
         """Return what the report describes and draws."""
         made = [*report.sections(self.documented, self.runs.units), fits(self.free_runs, self.judged[0])]
-        return made if self.motion is None else [*made, motions.section(self.motion, self.runs.units)]
+        return [*made, *self._to_move()]
+
+    def _to_move(self) -> list[Section]:
+        """The motion to record next, or how to have it designed where something is left open."""
+        found = self.outcome
+        is_open = found.verdict == "insufficient_excitation" or any(e.alternatives for e in found.effects)
+        asked = is_open or self.motion is not None
+        return [motions.section(self.motion, self.runs.units)] if asked else []
 
     def report(self, folder: str | Path) -> list[Path]:
         """Write report.json and report.html into a folder."""
@@ -223,8 +230,8 @@ class Diagnosed:
         title = report.Title(joint.name, self.runs.named, self.validated, joint.axis == "linear")
         name, record = self.judged
         made = beside(name, self.models, self.free_runs, record, self.runs.units)
-        more = [*([] if self.motion is None else [motions.section(self.motion, self.runs.units)]), *made]
-        return write(out, "report", self.as_json(), report.html_page(self.documented, title, more))
+        page = report.html_page(self.documented, title, [*self._to_move(), *made])
+        return write(out, "report", self.as_json(), page)
 
     def next_motion(
         self, seconds: float = 12.0, progress: Callable[[str], None] = lambda _: None

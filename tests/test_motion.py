@@ -139,6 +139,7 @@ def test_a_designed_motion_is_written_played_and_decides(tmp_path, capsys, monke
     assert (
         "What to move next" in page and "Model beside machine" in page and "residual of that channel" in page
     )
+    assert "--motion" not in page  # it is designed already
 
     _, played = written(tmp_path, '{ kind = "motion", file = "next.csv" }', "played.csv")
     moved = np.genfromtxt(played, delimiter=",", names=True)["motor1_position_rad"][:4000]

@@ -55,8 +55,11 @@ def as_json(motion: NextMotion) -> dict[str, Any]:
     }
 
 
-def section(motion: NextMotion, units: Units) -> Section:
-    """Describe and draw it."""
+def section(motion: NextMotion | None, units: Units) -> Section:
+    """Describe and draw it, or say how to have it designed."""
+    if motion is None:
+        hint = Paragraph("drivelink diagnose --motion next.csv designs the motion that tells most.")
+        return Section("What to move next", [hint])
     told, before, long = f"{motion.decides:.2f}", f"{motion.decided:.2f}", f"{motion.time_s[-1]:.3g} s"
     said = (
         f"This motion of {long} is expected to tell which it is with a probability of {told}, "

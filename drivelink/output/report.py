@@ -333,8 +333,6 @@ def _doubts(outcome: Diagnosis) -> list[Block]:
         if f.alternatives
     ]
     lines += outcome.advice
-    if outcome.verdict == "insufficient_excitation" or any(f.alternatives for f in outcome.effects):
-        lines.append("drivelink diagnose --motion next.csv designs a motion that tells them apart")
     if outcome.effects and not lines:
         lines.append("No other effect explains these data as well.")
     return [Lines(tuple(lines))] if lines else []

@@ -162,6 +162,11 @@ def test_what_is_not_valid_is_a_gap_and_both_plots_share_their_time_axis(tmp_pat
     assert torque.get_xlim() == stiffness.get_xlim() == (t[0], t[-1])
     for axes in figures[0].axes:  # which part of the recording that is, is said
         assert "not valid" in axes.get_legend_handles_labels()[1]
+    columns |= {"observable": 0.0 * t} | {
+        f"motor1_{name}": t for name in ("deflection_rad", "stiffness_nm_rad", "stiffness_std_nm_rad")
+    }
+    plots.plot_curves(columns, 1, tmp_path / "stiffness.png", "elbow")  # an empty plot says why
+    assert "never observable" in figures[1].axes[0].get_title(loc="left")
 
 
 @pytest.mark.parametrize("n", [3000, 300_000])

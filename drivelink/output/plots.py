@@ -233,7 +233,7 @@ def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, titl
     for i in range(1, motors + 1):
         phi, sigma, std = (columns[f"motor{i}_{name}"][seen] for name in names)
         curves[f"motor {i}"] = medians(phi, sigma, std=std)
-    title = "Stiffness of the transmission, where observable"
+    title = f"Stiffness of the transmission, {'where observable' if np.any(seen) else 'never observable'}"
     xy(axes[0], curves, "deflection / rad", "stiffness / (N·m/rad)", title)
     return save(figure, path)
 

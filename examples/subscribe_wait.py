@@ -14,7 +14,7 @@ TIMEOUT_S = 0.01  # ten cycles at 1 kHz
 
 def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: str = "10") -> None:
     end = time.monotonic() + float(seconds)
-    passes, safe = 0, True
+    passes, safe = 0, False
     with drivelink.subscribe(joint, endpoint=endpoint) as elbow:
         while time.monotonic() < end:
             estimate = elbow.wait(TIMEOUT_S)

@@ -4,7 +4,7 @@ import argparse
 import json
 import sys
 
-from drivelink.cli.monitor import add_zenoh
+from drivelink.cli.monitor import add_zenoh, nobody
 from drivelink.errors import ZenohError
 from drivelink.pubsub.clientbase import joints
 from drivelink.pubsub.session import ENDPOINT
@@ -24,15 +24,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the names; where there is none, that is a failure of zenoh's."""
-    endpoint = args.endpoint or ENDPOINT
-    names = joints(endpoint=endpoint, config=args.config, prefix=args.prefix or "drivelink")
+    endpoint, prefix = args.endpoint or ENDPOINT, args.prefix or "drivelink"
+    names = joints(endpoint=endpoint, config=args.config, prefix=prefix)
     if args.json:
         print(json.dumps(names))
     elif names:
         print("\n".join(names))
     else:
-        of = f" of prefix {args.prefix!r}" if args.prefix else ""
-        print(
-            f"no joint{of} at {args.config or endpoint}: drivelink run JOINT starts a daemon", file=sys.stderr
-        )
+        print(nobody(prefix, args.config or endpoint), file=sys.stderr)
     return 0 if names else ZenohError.exit_status

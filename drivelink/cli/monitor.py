@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
         elif not args.json and can_draw(console := Console()):
             _show(watcher, console, end, f"{prefix}/{name or '*'} at {config or endpoint}")
         else:
-            _print(watcher, end, args, f"{config or endpoint}")
+            _print(watcher, end, args, nobody(prefix, config or endpoint))
     return 0
 
 
@@ -188,7 +188,13 @@ def _picture(
     return Group(joints_table(shown, console.size.width), rest, *alarms, footer)
 
 
-def _print(watcher: Watcher, end: float, args: argparse.Namespace, where: str) -> None:
+def nobody(prefix: str, where: Path | str) -> str:
+    """Say that no daemon is there."""
+    of = "" if prefix == "drivelink" else f" of prefix {prefix!r}"
+    return f"no joint{of} at {where}: drivelink run JOINT starts a daemon"
+
+
+def _print(watcher: Watcher, end: float, args: argparse.Namespace, absent: str) -> None:
     """Print a line or JSON object per joint at each interval; a line only if it says something new.
 
     Raises:
@@ -217,8 +223,7 @@ def _print(watcher: Watcher, end: float, args: argparse.Namespace, where: str) -
                 said.clear()
         time.sleep(_POLL_S)
     if not seen:
-        nobody = f"no joint at {where}: drivelink run JOINT starts a daemon"
-        hint = next((view.hint for view in watcher.views.values() if view.hint), nobody)
+        hint = next((view.hint for view in watcher.views.values() if view.hint), absent)
         raise ZenohError(f"{hint} (waited {now - there:.0f} s)")
 
 

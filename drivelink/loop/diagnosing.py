@@ -245,5 +245,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    logging.getLogger("drivelink.recording").setLevel(logging.ERROR)  # the daemon has said what was missing
+    for said in ("drivelink.recording", "drivelink.jointfile"):  # the daemon has said what is missing, edited
+        logging.getLogger(said).setLevel(logging.ERROR)
     sys.exit(main())

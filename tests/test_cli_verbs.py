@@ -270,6 +270,13 @@ def test_output_that_cannot_be_written_is_one_line_and_a_failure(arguments):
     assert done.stderr.endswith(": standard output: No space left on device\n")
 
 
+def test_closed_outputs_are_no_traceback():
+    for closed, said in ((">&-", b""), ("2>&-", b"drivelink"), (">&- 2>&-", b"")):
+        run = ["sh", "-c", f"exec {sys.executable} -m drivelink --version {closed}"]
+        done = subprocess.run(run, capture_output=True, timeout=60)
+        assert done.returncode == 0 and done.stdout.startswith(said) and done.stderr == b"", done
+
+
 def test_an_interrupt_while_modules_are_loaded_prints_no_traceback(tmp_path):
     stub = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
     (tmp_path / "argparse.py").write_text(stub)

@@ -128,6 +128,9 @@ def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit status."""
+    for name in ("stdout", "stderr"):  # closed by whoever started it: no file may get its descriptor
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
     try:
         status = _main(argv)
     except KeyboardInterrupt:  # also while an error is being said

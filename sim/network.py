@@ -10,7 +10,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 
 import can
 
@@ -340,10 +339,7 @@ class Bench:
             joints.append(f"{name} ({', '.join(nodes)})")
         return "; ".join(joints)
 
-    def write_eds(self, directory: Path) -> None:
-        """Write the EDS file of every device."""
-        directory.mkdir(parents=True, exist_ok=True)
-        for name, group in self._groups:
-            for node in group:
-                file = f"{name}-node{node.node_id}.eds"
-                (directory / file).write_text(node.eds(file), encoding="ascii")
+    def eds(self) -> dict[str, str]:
+        """Return the EDS file of every device by its name."""
+        files = {f"{name}-node{node.node_id}.eds": node for name, group in self._groups for node in group}
+        return {file: node.eds(file) for file, node in files.items()}

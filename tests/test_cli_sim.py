@@ -2,6 +2,7 @@
 
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -78,4 +79,9 @@ def test_it_ends_by_itself_and_leaves_the_data_sheets(file, tmp_path, capsys):
     assert main(["sim", *arguments]) == 0
     assert "ready on virtual vcan0" in capsys.readouterr().out
     assert (tmp_path / "wrist-node1.eds").is_file()
+    full = 'ulimit -f 0; exec "$0" -m drivelink sim "$@"'
+    done = subprocess.run(
+        ["sh", "-c", full, sys.executable, *arguments], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1 and f"{tmp_path}/wrist-node" in done.stderr, done
     assert signal.getsignal(signal.SIGTERM) is before

@@ -14,6 +14,7 @@ from drivelink.cycle.realtime import PRIORITY, acquire, release
 from drivelink.demo.simbus import JoinedBus, open_sim_bus, require_free
 from drivelink.demo.simulate import assumptions, bench_from_joints
 from drivelink.errors import BusError, UsageError
+from drivelink.files import write_whole
 from drivelink.jointfile import BusSection, JointFile, load
 from drivelink.jointfile.schema import SimSection
 
@@ -68,7 +69,9 @@ def run(args: argparse.Namespace) -> int:
         for line in assumptions(joint):
             print(f"drivelink sim: {path}: {line}", file=sys.stderr)
     if args.write_eds:
-        bench.write_eds(args.write_eds)
+        args.write_eds.mkdir(parents=True, exist_ok=True)
+        for file, text in bench.eds().items():
+            write_whole(args.write_eds / file, text, force=True)
     if section.interface == "virtual":
         print(ALONE, file=sys.stderr)
     stop = threading.Event()

@@ -118,7 +118,8 @@ def _examples(folder: Path) -> Path:
         shutil.copytree(source, target, ignore=shutil.ignore_patterns("target", "__pycache__"))
     except shutil.Error as error:  # of every file; the first is enough
         shutil.rmtree(target, ignore_errors=True)
-        raise DrivelinkError(f"--examples: {error.args[0][0][2]}") from error
+        _, file, why = error.args[0][0]  # "[Errno 28] No space left on device: 'from' -> 'to'"
+        raise DrivelinkError(f"{file}: {why.partition('] ')[2].partition(': ')[0]}") from error
     return target
 
 

@@ -203,7 +203,7 @@ class DemoRun:
         self._live = live
         self._screen: Live | None = None
         self._period_s = joint.bus.period_s
-        self._next_line_s = 0.0
+        self._next_line_s, self._said = 0.0, ""
 
     def follow(self, rig: RigProcess, subscription: Subscription) -> bool:
         """Follow the rig to its end; return whether Ctrl-C ended it early.
@@ -268,4 +268,6 @@ class DemoRun:
             if self._screen is not None:
                 self._screen.refresh()
             else:
-                sys.stderr.write(f"{stamped(self._view.line(), sys.stderr)}\n")
+                if (line := self._view.line()) != self._said:
+                    sys.stderr.write(f"{stamped(line, sys.stderr)}\n")
+                self._said = line

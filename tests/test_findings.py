@@ -64,6 +64,8 @@ TWIN = {"alternatives": ("motor_inertia",), "alternative_probabilities": (0.4,)}
 )  # fmt: skip
 def test_an_effect_is_said_as_surely_as_it_is_known(effects, said):
     assert sentence(outcome(*effects, advice=("about another effect",))).startswith(said)
+    two = replace(outcome(*effects), transmissions=(None, None))
+    assert sentence(two).startswith(said.replace("the motor", "motor 1").replace("(motor)", "(motor 1)"))
 
 
 def test_each_candidate_has_one_probability_whoever_names_it():

@@ -24,10 +24,9 @@ def sentence(outcome: Diagnosis) -> str:
     names = " and ".join(title_of(finding, outcome) for finding in outcome.effects)
     if outcome.verdict == "unexplained":
         where = outcome.effects[0]
-        place = _place(where, outcome)
         over = " and ".join(name.replace("_", " ") for name in where.coordinates)
         by = "a free curve" if free_curve(outcome) else "what was tried"
-        return f"The model lacks something at the {place} that is not in the library" + (
+        return f"The model lacks something at {_at(where, outcome)} that is not in the library" + (
             f", a function of {over}: with {by} {fall}."
             if lower
             else f", and {by} over {over} does not lower {error}, {percent(held.before_relative, 2)}."
@@ -44,7 +43,7 @@ def lacks(outcome: Diagnosis) -> str:
     sure = [title_of(f, outcome) for f in outcome.effects if f.probability >= SURE]
     likely = [_likely(f, outcome) for f in outcome.effects if _LIKELY <= f.probability < SURE]
     nameless = [f for f in outcome.effects if f.probability < _LIKELY]
-    unsure = sorted({_place(f, outcome) for f in nameless})
+    unsure = sorted({_at(f, outcome) for f in nameless})
     said = []
     if sure:
         said.append(f"The model lacks {' and '.join(sure)}")
@@ -53,7 +52,7 @@ def lacks(outcome: Diagnosis) -> str:
     if unsure:
         about = (line for f in nameless for line in advice_for(f.name, f.alternatives))
         to_do = next(about, "record another motion, faster, slower and wider")
-        said.append(f"something at the {' and '.join(unsure)} has no likely name yet ({to_do})")
+        said.append(f"something at {' and '.join(unsure)} has no likely name yet ({to_do})")
     text = "; ".join(said)
     return text[0].upper() + text[1:]
 
@@ -86,7 +85,7 @@ def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
 def title_of(finding: Finding, outcome: Diagnosis) -> str:
     """Return an effect in words, with its place."""
     if finding.name == "unlisted":
-        return f"an unlisted effect at the {_place(finding, outcome)}"
+        return f"an unlisted effect at {_at(finding, outcome)}"
     return f"{in_words(finding.name)} ({_place(finding, outcome)})"
 
 
@@ -100,3 +99,9 @@ def _place(finding: Finding, outcome: Diagnosis) -> str:
     """Return its location, with the motor's number where there are two."""
     several = len(outcome.transmissions) > 1 and finding.motor is not None
     return f"{finding.location} {(finding.motor or 0) + 1}" if several else finding.location
+
+
+def _at(finding: Finding, outcome: Diagnosis) -> str:
+    """Return its location after "at"."""
+    place = _place(finding, outcome)
+    return place if place[-1].isdigit() else f"the {place}"

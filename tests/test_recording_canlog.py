@@ -108,6 +108,8 @@ def test_of_several_channels_the_configured_one_is_taken(tmp_path):
     assert {f.can_id for f in read_frames(path, channel="can0", configured="can1")} == {0x180}
     with pytest.raises(RecordingError, match=r"channels can0, can1: say which one with --channel"):
         list(read_frames(path, configured="vcan7"))
+    with pytest.raises(RecordingError, match=r"no frame of channel can7: expected one of can0, can1"):
+        list(read_frames(path, channel="can7"))
 
 
 @pytest.mark.parametrize(

@@ -314,6 +314,8 @@ def test_what_a_daemon_said_counts_more_than_a_file_beside_the_recording(tmp_pat
     sink.close()
     assert len(recorded_layouts(tmp_path / "r.mcap", joint.name, daemon=False)) == 1
     assert len(recorded_layouts(tmp_path / "r.mcap", joint.name, daemon=True)) == len(layouts)
+    with pytest.raises(RecordingError, match="no raw CAN in it"):
+        open_playback(tmp_path / "r.mcap", joint, tmp_path, frames=True)
     (tmp_path / "r.log.mapping.json").write_text('{"joint": "elbow", "nodes": 7}')
     with pytest.raises(RecordingError, match="its mapping cannot be read"):
         recorded_layouts(tmp_path / "r.log", joint.name, daemon=False)

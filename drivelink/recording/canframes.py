@@ -234,8 +234,11 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
 
 
 def _mcap_frames(path: Path) -> Iterator[LoggedFrame]:
+    message = None
     for message in read_messages(path, frozenset({"can"})):
         try:
             yield logged((message.log_time_ns, *json_frame(message.data), ""))
         except ValueError as error:
             raise RecordingError(f"{path}: {message.topic[:80]} is no frame of drivelink: {error}") from error
+    if message is None:
+        raise RecordingError(f"{path}: no raw CAN in it, samples alone")

@@ -103,11 +103,27 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
     reader = CAN_FORMATS[path.suffix.lower()].reader
     frames = _foreign_frames(path, reader) if reader else _text_frames(path)
     head = list(islice(frames, _LOOK_AHEAD))
+    if not head:
+        raise RecordingError(f"{path}: no CAN frame with an 11-bit identifier in it")
     chosen = channel or _channel(head, configured, path)
     whole: Iterator[LoggedFrame] = chain(head, frames)
     if chosen is not None:
-        whole = (frame for frame in whole if _same_channel(frame.channel, chosen))
+        names = ", ".join(dict.fromkeys(frame.channel for frame in head))
+        whole = _of(chosen, whole, f"{path}: no frame of channel {chosen}: expected one of {names}")
     return in_order(whole, path)
+
+
+def _of(channel: str, frames: Iterable[LoggedFrame], absent: str) -> Iterator[LoggedFrame]:
+    """Yield the frames of a channel.
+
+    Raises:
+        RecordingError: there is none; it says `absent`.
+    """
+    frame = None
+    for frame in (one for one in frames if _same_channel(one.channel, channel)):
+        yield frame
+    if frame is None:
+        raise RecordingError(absent)
 
 
 def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]:
@@ -145,10 +161,8 @@ def _channel(head: list[LoggedFrame], configured: str, path: Path) -> str | None
     """Select the channel by the first frames of a log; None: there is only one.
 
     Raises:
-        RecordingError: no frame at all, or several channels and none is the configured one.
+        RecordingError: several channels, and none is the configured one.
     """
-    if not head:
-        raise RecordingError(f"{path}: no CAN frame with an 11-bit identifier in it")
     found = list(dict.fromkeys(frame.channel for frame in head))
     if len(found) == 1:
         return None

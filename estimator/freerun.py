@@ -6,7 +6,7 @@ starts from the measured state, for a joint without position control drifts in a
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,9 @@ Element = tuple[EffectType, Mapping[str, float]]
 class FreeRun:
     """Measured and simulated positions."""
 
-    time_s: FloatArray  # (n,)
-    measured_rad: FloatArray  # (n, c), by column of `channels`
-    simulated_rad: FloatArray  # (n, c)
+    time_s: FloatArray = field(repr=False)  # (n,)
+    measured_rad: FloatArray = field(repr=False)  # (n, c), by column of `channels`
+    simulated_rad: FloatArray = field(repr=False)  # (n, c)
     # "motor1_position", …, "link_position" where the link is simulated, "motor1_deflection", …
     channels: tuple[str, ...]
     horizon_s: float  # time between new starts from the measured state

@@ -6,7 +6,7 @@ The simulated VSA-II, its CANopen drives and the daemon's own cycle run in this 
 What is recorded goes through `drivelink.fit` and `drivelink.diagnose`, as a recording of a real joint would.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import drivelink
@@ -49,7 +49,7 @@ def record(path: Path, seconds: float, *effects: str, run: int = 0) -> None:
     recorder.file.close()
 
 
-def main(folder: str = "close_the_loop") -> None:
+def main(folder: str) -> None:
     out = Path(folder)
     out.mkdir(parents=True, exist_ok=True)
     healthy, suspect, model = out / "healthy.csv", out / "suspect.csv", out / "elbow.toml"
@@ -67,4 +67,8 @@ def main(folder: str = "close_the_loop") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", nargs="?", default="close_the_loop")
+    main(parser.parse_args().folder)

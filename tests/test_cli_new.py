@@ -1,6 +1,8 @@
 import errno
 import io
 import re
+import subprocess
+import sys
 
 import pytest
 from daemonkit import served
@@ -123,7 +125,9 @@ def test_the_examples_are_copied_once(tmp_path, capsys):
     for page in (tmp_path / "examples").rglob("*.md"):  # beside it is no checkout
         links = re.findall(r"\]\(([^):]+)\)", page.read_text(encoding="utf-8"))
         assert all((page.parent / link).exists() for link in links), links
-    assert (tmp_path / "examples" / "close_the_loop.py").exists()
+    script = [sys.executable, str(tmp_path / "examples" / "close_the_loop.py"), "--help"]
+    assert subprocess.run(script, cwd=tmp_path, capture_output=True, timeout=60).returncode == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["examples"]  # a folder of that name is not made
     assert main(["new", "--examples", str(tmp_path)]) == 2
     assert "is there already" in capsys.readouterr().err
 

@@ -126,6 +126,7 @@ def run(seconds: float = 1.5) -> Record:
 
 def test_the_free_run_of_the_true_model_is_what_another_integrator_gives():
     made = free_run(run(), joint(effects=(FRICTION,)), 1.5)
+    assert "array" not in repr(made)  # its numbers, in a line
     assert made.channels == ("motor1_position", "link_position", "motor1_deflection")
     assert min(made.fit_percent.values()) > 99.0
     assert max(made.coasting_percent.values()) < 10.0  # no fit for nothing

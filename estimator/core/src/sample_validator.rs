@@ -206,14 +206,17 @@ impl SampleValidator {
         self.review();
         let was_frozen = self.memory.frozen;
         let frozen = self.stands_still(&places, &sample.motor_torque);
-        if self.jumped(&places, periods as f64) {
+        let jumped = self.jumped(&places, periods as f64);
+        if jumped && frozen {
+            self.memory.slopes = [0.0; PLACES]; // the jump is that it stopped
+        } else if jumped {
             self.memory.rejected += 1;
             if was_frozen {
                 // It was the frozen value that was wrong.
                 return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, None);
             }
             if self.memory.rejected < self.patience {
-                return Accepted { frozen, ..rejected };
+                return rejected;
             }
             let jumps = Some(self.jumps(&places, periods as f64));
             return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, jumps);

@@ -38,9 +38,9 @@ impl SampleValidator {
                     m.stopped_dead[i] = stops_dead(&self.trail, i, m.steps[i], bend);
                 }
                 // A torque always counts as one that was moving before.
-                let longer = m.usual[i] > 0 && run > self.still.max(3 * m.usual[i]);
+                let longer = m.usual[i] > 0 && run >= self.still.max(3 * m.usual[i]);
                 if longer && (i >= watched || m.stopped_dead[i]) {
-                    still = Some(i);
+                    still = still.or(Some(i));
                 }
             } else {
                 if i < watched {
@@ -55,7 +55,9 @@ impl SampleValidator {
         self.trail.pop_front();
         self.trail.push_back(*places);
         m.motion += 0.05 * (moving - m.motion);
-        m.frozen = still.is_some() && m.motion > MOVING;
+        // One that stopped dead goes on being frozen when nothing else moves any more: all may be.
+        let dead = still.is_some_and(|place| place < watched);
+        m.frozen = still.is_some() && m.motion > MOVING || dead && m.frozen;
         let frozen = m.frozen;
         if let Some(place) = still.filter(|_| frozen) {
             self.found = Some((self.signal(place), Reason::Frozen));
@@ -77,6 +79,7 @@ impl SampleValidator {
             let bend = (slopes[i] - m.slopes[i]).abs();
             if checked && bend > m.limits[i] {
                 m.astray[i] = true;
+                m.stopped_dead[i] |= m.runs[i] == 1; // its stop is the jump
                 jumped = true;
                 let signal = if i < self.motors { Signal::MotorPosition(i) } else { Signal::LinkPosition };
                 self.found = Some((signal, Reason::Jumped));

@@ -198,6 +198,17 @@ def test_a_drive_that_hangs_in_the_first_second_of_motion_is_noticed(name, rest_
     assert not any(valid[980:1755]) and any(valid[-1000:])
 
 
+def test_a_link_encoder_that_repeats_itself_for_a_moment_has_not_moved_its_zero():
+    motion, valid = kit.motion("vsa-ii", 8.0, seed=5), []
+    estimator = kit.make_estimator(kit.declared("vsa-ii"), kit.EstimatorSettings(), kit.PERIOD_S)
+    hung, rms = motion.samples[1512].link_position_rad, np.sqrt(np.mean(motion.torque_nm**2))
+    for k, sample in enumerate(motion.samples):
+        one = estimator.step(sample._replace(link_position_rad=hung) if 1512 <= k < 1542 else sample)
+        valid.append(one.status & kit.VALID)
+        assert not valid[-1] or abs(one.flexibility_torque_nm - motion.torque_nm[k]) < 0.25 * rms, k
+    assert np.mean(valid[2000:]) > 0.9
+
+
 def test_an_encoder_that_moves_its_zero_is_followed(rig):
     samples = list(rig.record(0).samples())
     for k in range(4000, len(samples)):

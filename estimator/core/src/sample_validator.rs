@@ -11,6 +11,7 @@ use crate::library::ABSURD;
 use crate::model::Model;
 use crate::sample::{MOTORS, Sample, status};
 use crate::suspicion::{Reason, Signal, Suspicion};
+use channels::MOVING;
 
 const PLACES: usize = MOTORS + 1;
 const CHANNELS: usize = 2 * MOTORS + 1;
@@ -75,6 +76,7 @@ struct Memory {
     astray: [bool; PLACES],
     values: Option<[f64; CHANNELS]>,
     runs: [u32; CHANNELS],
+    stood: [u32; CHANNELS], // the run before the last change
     usual: [u32; CHANNELS],
     torque: f64,
     largest: [f64; MOTORS],
@@ -100,6 +102,7 @@ const FRESH: Memory = Memory {
     astray: [false; PLACES],
     values: None,
     runs: [0; CHANNELS],
+    stood: [0; CHANNELS],
     usual: [0; CHANNELS],
     torque: 0.0,
     largest: [0.0; MOTORS],
@@ -206,13 +209,14 @@ impl SampleValidator {
         self.review();
         let was_frozen = self.memory.frozen;
         let frozen = self.stands_still(&places, &sample.motor_torque);
+        let first = self.memory.rejected == 0;
         let jumped = self.jumped(&places, periods as f64);
         if jumped && frozen {
             self.memory.slopes = [0.0; PLACES]; // the jump is that it stopped
         } else if jumped {
             self.memory.rejected += 1;
-            if was_frozen {
-                // It was the frozen value that was wrong.
+            if was_frozen || first && self.has_stood() {
+                // It was the repeated value that was wrong.
                 return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, None);
             }
             if self.memory.rejected < self.patience {
@@ -253,6 +257,14 @@ impl SampleValidator {
         is_none(&size).then(|| watched.iter().position(is_none).unwrap_or(self.motors))
     }
 
+    /// Whether one that jumps has repeated itself before, having stopped dead or for longer than it does in motion.
+    fn has_stood(&self) -> bool {
+        let m = &self.memory;
+        let longer = |i: usize| m.stopped_dead[i] || m.usual[i] > 0 && m.stood[i] > m.usual[i];
+        let stood = |i: usize| m.astray[i] && m.stood[i] > PATIENCE && longer(i);
+        m.motion > MOVING && (0..self.watched()).any(stood)
+    }
+
     /// By how much each zero has moved, of those that have.
     fn jumps(&self, places: &[f64; PLACES], periods: f64) -> [f64; PLACES] {
         let (m, watched) = (&self.memory, self.watched());
@@ -274,7 +286,7 @@ impl SampleValidator {
         m.slopes = [0.0; PLACES];
         self.trail.iter_mut().for_each(|places| *places = [f64::NAN; PLACES]);
         m.astray = [false; PLACES];
-        (m.values, m.frozen, m.seen, m.rejected) = (None, false, 0, 0);
+        (m.frozen, m.seen, m.rejected) = (false, 0, 0);
         self.review();
         Accepted { periods: 1, restart: true, status, jumps, ..Accepted::default() }
     }

@@ -11,7 +11,7 @@ use crate::suspicion::{Reason, Signal};
 const ROUNDING: f64 = 4e-9;
 const SINGLE: f64 = 2.5e-7; // … and of one in single precision
 const FINEST: f64 = 1e-6; // of a change: no joint moves by a million counts in a period
-const MOVING: f64 = 0.2; // share of the last 20 samples in which a position has changed
+pub(super) const MOVING: f64 = 0.2; // share of the last 20 samples in which a position has changed
 
 impl SampleValidator {
     /// Whether a channel is frozen: everything at rest is no fault, one encoder count now and then no motion.
@@ -49,7 +49,7 @@ impl SampleValidator {
                 if learns {
                     m.usual[i] = m.usual[i].max(run);
                 }
-                m.runs[i] = 0;
+                (m.stood[i], m.runs[i]) = (m.runs[i], 0);
             }
         }
         self.trail.pop_front();

@@ -135,7 +135,7 @@ def _clustered(
     """
     regression = fitted.regression
     weight = np.sqrt(1.0 / (fitted.times * fitted.posterior.sigma**2))[regression.group]
-    rows = regression.design[:, free] * (weight[:, None] * unit)
+    rows = regression.tangent(fitted.posterior.x)[:, free] * (weight[:, None] * unit)
     left = regression.residual(fitted.posterior.x) * weight
     sizes, directions = np.linalg.eigh(bread)
     root = directions * np.sqrt(np.maximum(sizes, 0.0))  # rounding may leave one below zero

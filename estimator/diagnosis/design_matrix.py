@@ -200,7 +200,7 @@ class Stack:
             slopes = np.stack([self._torque_scale(self.slots[j], terms) for j in mine], axis=1)
             same = bool(np.all(slopes == slopes[0]))
             groups = tuple(k * first.equations + i for k in range(len(self._frames)))
-            made.append(Scale(groups, np.array(mine), slopes[:1] if same else slopes))
+            made.append(Scale(groups, np.array(mine), slopes[:1] if same else slopes, i < motors))
         return tuple(made)
 
     def _scales(self, slot: Slot, balance: int) -> bool:

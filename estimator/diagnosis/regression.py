@@ -26,16 +26,19 @@ class Scale(NamedTuple):
     If errors are the torque's, r / s is the residual; if they are the model's, r is. Minimising the first
     favours a large s, minimising the second a small one. As the source is unknown, x is the compromise of
     geometric mean regression, and the evidence is the lower of the two: a scale that reduces errors under one
-    assumption only does not pay.
+    assumption only does not pay. No torque is measured of a link's balance: its errors are those of the
+    readings that s multiplies, so r / s is the residual (`Regression.tangent`).
 
     Attributes:
         groups: the balances. columns: (j,) the entries of x that scale them.
         slopes: (m, j) at the moments of the rows; one moment, where it is the same at all of them.
+        measured: whether a torque is measured; else the scale is the same at all moments.
     """
 
     groups: tuple[int, ...]
     columns: NDArray[np.int64]
     slopes: FloatArray
+    measured: bool = True
 
     def sizes(self, x: FloatArray) -> FloatArray:
         """Return (m,) s at each moment."""
@@ -45,7 +48,8 @@ class Scale(NamedTuple):
         """Return the divisor of r in the less favourable of both assumptions: geometric mean of
         s, at most one.
         """
-        return min(float(np.exp(np.mean(np.log(self.sizes(x))))), 1.0)
+        size = float(np.exp(np.mean(np.log(self.sizes(x)))))
+        return min(size, 1.0) if self.measured else size
 
 
 class Posterior(NamedTuple):
@@ -167,13 +171,28 @@ class Regression:
         precision = np.tensordot(weights, self._grams.matrix, axes=1)
         precision.flat[:: len(x) + 1] += prior
         side = weights @ self._grams.side + self.mean * self._unit * prior
-        for scale in self.scales:  # Newton's step of -sum log s / 2
+        for scale in self.scales:
+            if not scale.measured:  # Gauss and Newton's step of the sum of (r / s)²
+                slope, left = self._relative_slope(scale, x), self._grams.left(x)
+                for g in scale.groups:
+                    both = np.outer(self._grams.side[g] - self._grams.matrix[g] @ x, slope)
+                    more = weights[g] * (both + both.T + left[g] * np.outer(slope, slope))
+                    precision += more
+                    side += weights[g] * left[g] * slope + more @ x
+                continue
+            # Newton's step of -sum log s / 2
             rows = 0.5 * sum(self._grams.rows[g] / float(times[g]) for g in scale.groups)
             steep = scale.slopes / self._unit[scale.columns] / scale.sizes(x / self._unit)[:, None]
             curvature = rows * (steep.T @ steep) / len(steep)
             precision[np.ix_(scale.columns, scale.columns)] += curvature
             side[scale.columns] += rows * steep.mean(axis=0) + curvature @ x[scale.columns]
         return precision, side
+
+    def _relative_slope(self, scale: Scale, x: FloatArray) -> FloatArray:
+        """(k,) change of log s per unit of the scaled columns, of a scale that is the same at all moments."""
+        slope = np.zeros(len(x))
+        slope[scale.columns] = scale.slopes[0] / self._unit[scale.columns] / scale.sizes(x / self._unit)
+        return slope
 
     def _sizes(self, x: FloatArray) -> FloatArray:
         """(groups,) scale of each balance against the measurement."""
@@ -208,6 +227,18 @@ class Regression:
         """Return (n,) residual of every row."""
         return np.asarray(self.target - self.design @ x)
 
+    def tangent(self, x: FloatArray) -> FloatArray:
+        """Return (n, k) what the residual of every row falls by per unit of x, its balance's scale kept:
+        the design, where a torque is measured.
+        """
+        design = self.design
+        for scale in self.scales:
+            if not scale.measured:
+                slope = self._relative_slope(scale, x * self._unit) * self._unit
+                mine = np.isin(self.group, scale.groups)
+                design = design + np.where(mine, self.residual(x), 0.0)[:, None] * slope
+        return design
+
     def left_out(self, times: FloatArray, posterior: Posterior, labels: NDArray[np.int64]) -> FloatArray:
         """Return the (n,) residual of each row under the fit without all rows of its label.
 
@@ -221,11 +252,12 @@ class Regression:
         x, free = posterior.x * self._unit, ~posterior.bound
         precision, side = self._normal(times, posterior.sigma, x)
         weight = (1.0 / (times * posterior.sigma**2))[self.group]
-        design, held = self.design / self._unit, np.where(free, 0.0, x)
+        design, held = self.tangent(posterior.x) / self._unit, np.where(free, 0.0, x)
         low, left = self.low * self._unit, np.empty(len(self.target))
+        aims = self.residual(posterior.x) + design @ x
         for label in np.unique(labels):
             mine = labels == label
-            own, y = design[mine], self.target[mine]
+            own, y = design[mine], aims[mine]
             weighted = own.T * weight[mine]
             rest, target = precision - weighted @ own, side - weighted @ y
             there = held.copy()

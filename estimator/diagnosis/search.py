@@ -333,7 +333,7 @@ class Search:
         problem, posterior = self.problem, parent.posterior
         weights = 1.0 / (parent.times * posterior.sigma**2)
         weight = weights[problem.group]
-        cross = self._columns @ (parent.regression.design * weight[:, None])
+        cross = self._columns @ (parent.regression.tangent(posterior.x) * weight[:, None])
         sides = self._columns @ (parent.regression.residual(posterior.x) * weight)
         taken = {t.candidate.key for t in parent.terms}
         for entry in self._library:

@@ -19,10 +19,11 @@ from estimator.diagnosis.findings import DELAYS, stamped_wrongly
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.heldout import Held, held_out
 from estimator.diagnosis.hypothesis import Fitted
-from estimator.diagnosis.order import ordered
+from estimator.diagnosis.order import ordered, sharp
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
+from estimator.effects import sharpened
 from estimator.errors import EstimatorError
 from estimator.gate import check, without_hold
 from estimator.model import JointModel, ParameterValue, Transmission
@@ -115,6 +116,7 @@ class JointFit(NamedTuple):
     covariance: FloatArray
     absent: frozenset[Key] = frozenset()  # optional errors that the data do not support
     doubts: tuple[str, ...] = ()  # time stamps that may be wrong, one line each
+    smoothing_rad_s: float | None = None  # see `estimator.diagnosis.order.sharp`
 
     @property
     def problem(self) -> Problem:
@@ -184,16 +186,20 @@ def fit_joint(
     most = widest(max(one.period_s for one in usable))
     if not 0.0 < bandwidth_hz <= most:
         raise EstimatorError(f"bandwidth: expected more than 0 and at most {most:g} Hz, got {bandwidth_hz:g}")
-    problem, fitted = ordered(
-        _bare(model), lambda model, like: _joint_problem(usable, model, bandwidth_hz, like)
-    )
+
+    def made(model: JointModel, like: Problem | None) -> Problem:
+        return _joint_problem(usable, model, bandwidth_hz, like)
+
+    bare = _bare(model)
+    smoothing_rad_s = sharp(bare, made)
+    problem, fitted = ordered(sharpened(bare, smoothing_rad_s), made)
     held = held_out(problem)
     search = Search(problem, held, null=fitted)
     surplus = held.surplus(fitted)
     free = JointFit(search, surplus, fitted, _covariance(search, fitted, surplus))
     stamps = (_stamped_wrongly(free, key) for key in _optional(free))
     doubts = tuple(dict.fromkeys(one for one in stamps if one))
-    return _aligned(free._replace(doubts=doubts))
+    return _aligned(free._replace(doubts=doubts, smoothing_rad_s=smoothing_rad_s))
 
 
 def _joint_problem(

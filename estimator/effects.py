@@ -9,7 +9,7 @@ its error.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
@@ -17,8 +17,10 @@ import numpy as np
 from estimator import _core
 from estimator._core import STOP_EXPONENT as STOP_EXPONENT
 from estimator.errors import EstimatorError
-from estimator.model import Effect
+from estimator.model import Effect, JointModel
 from estimator.sample import FloatArray
+
+_SMOOTHING = "smoothing_rad_s"
 
 Location = Literal["motor", "transmission", "link", "measurement"]
 Channel = Literal["torque", "motor_torque", "deflection", "link_position"]
@@ -162,6 +164,31 @@ def elements(effect: Effect) -> tuple[EffectType, list[dict[str, float]]]:
     return kind, [
         {name: v[i] if isinstance(v, tuple) else v for name, v in values.items()} for i in range(count)
     ]
+
+
+def open_smoothing(model: JointModel) -> bool:
+    """Return whether a joint file leaves out over which velocity some dry friction changes its sign."""
+    effects = (*model.link_effects, *(effect for motor in model.motors for effect in motor.effects))
+    return any(map(_is_open, effects))
+
+
+def sharpened(model: JointModel, smoothing_rad_s: float | None) -> JointModel:
+    """Return the joint with that velocity where it is left out; None: as it is."""
+    if smoothing_rad_s is None:
+        return model
+
+    def sharp(effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
+        more = {_SMOOTHING: smoothing_rad_s}
+        return tuple(
+            replace(one, parameters={**one.parameters, **more}) if _is_open(one) else one for one in effects
+        )
+
+    motors = tuple(replace(motor, effects=sharp(motor.effects)) for motor in model.motors)
+    return replace(model, motors=motors, link_effects=sharp(model.link_effects))
+
+
+def _is_open(effect: Effect) -> bool:
+    return _SMOOTHING in LIBRARY[effect.name].nonlinear and _SMOOTHING not in effect.parameters
 
 
 def in_words(name: str) -> str:

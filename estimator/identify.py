@@ -12,7 +12,7 @@ from estimator.batch import JointFit, TransmissionFit, fit_joint, transmission_f
 from estimator.choices import chance
 from estimator.diagnosis.candidates import sign_smoothing
 from estimator.diagnosis.heldout import Residual, residual_of, wider
-from estimator.effects import elements
+from estimator.effects import elements, sharpened
 from estimator.model import Effect, JointModel, LinkDynamics, Motor, Transmission
 from estimator.ranges import range_of
 from estimator.sample import Record
@@ -71,6 +71,7 @@ def identify(
         EstimatorError: a recording lacks what is needed, is too short, or nothing moves in it.
     """
     joint = fit_joint(record, model, bandwidth_rad_s)
+    model = sharpened(model, joint.smoothing_rad_s)
     fits = transmission_fits(joint)
     notes = [*joint.doubts, *joint.problem.clipped, *wider(joint.surplus)]
     motors = tuple(

@@ -256,6 +256,23 @@ def test_a_constant_torque_of_a_rigid_joint_is_written_beside_what_is_found():
     assert offset.parameters["torque_nm"] == pytest.approx(0.5, abs=0.02)
 
 
+def test_a_constant_torque_of_the_motors_side_alone_is_written_as_the_zero_of_its_encoders():
+    """As `fit` does: with half of it as either, or all as a torque, what the spring carries was off by it."""
+    joint = jointfile.parse(
+        f'name = "axis"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\nviscous_damping_nm_s_rad = {kit.DAMPING}\n'
+        'transmission = { model = "linear" }\n'
+    )
+    healthy, zero = record(SOFT, strange_nm=0.0), 0.008
+    assert healthy.link_position_rad is not None
+    found = diagnose(replace(healthy, link_position_rad=healthy.link_position_rad + zero), joint.model())
+    assert [(effect.name, effect.alternatives) for effect in found.effects] == [
+        ("torque_offset", ("deflection_offset",))
+    ]
+    (written,) = (e for e in diagnosed_model(joint, found).motors[0].effects if "offset" in e.name)
+    assert written.name == "deflection_offset"
+    assert written.parameters["offset_rad"] == pytest.approx(zero, rel=0.02)
+
+
 def test_a_file_is_not_written_while_its_balance_leaves_more_than_the_spring_carries(healthy):
     model, law = kit.model(), Transmission(model="linear", parameters={"k_nm_rad": 1e-3 * kit.STIFFNESS})
     weak = replace(model, motors=(replace(model.motors[0], transmission=law),))

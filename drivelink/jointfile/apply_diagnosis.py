@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 from drivelink import jointfile
 from drivelink.jointfile import JointFile, JointText
 from drivelink.version import __version__
-from estimator.effects import LIBRARY
+from estimator.effects import LIBRARY, sharpened
 from estimator.errors import EstimatorError
 from estimator.model import Effect, JointModel, Transmission
 from estimator.model_monitor import (
@@ -110,7 +110,7 @@ def origin(records: Sequence[Record], recording: str, **more: Any) -> dict[str, 
 
 def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
     """Return the model that `write` writes."""
-    model = joint.model()
+    model = sharpened(joint.model(), outcome.smoothing_rad_s if _decided(outcome) else None)
     motors = tuple(
         replace(
             motor,
@@ -128,8 +128,8 @@ def _all_effects(declared: tuple[Effect, ...], outcome: Diagnosis, motor: int | 
     made = [*declared, *_readings(outcome, motor)]
     for finding in outcome.effects if _decided(outcome) else ():
         kind = LIBRARY.get(finding.name)
-        if kind is None:
-            continue
+        if kind is None or (finding.name == "torque_offset" and "deflection_offset" in finding.alternatives):
+            continue  # the latter is among the readings
         # A common zero of all deflections belongs to every motor.
         common = kind.channel == "deflection" and finding.motor is None and motor is not None
         here = kind.on_link if motor is None else not kind.on_link and finding.motor == motor

@@ -288,17 +288,22 @@ def _vary(fixed: Values, name: str, values: Iterable[float]) -> list[dict[str, f
 
 
 def _waves(frame: Frame, c: Coordinates, ripples: int) -> FloatArray:
-    """Periods per revolution whose ripple is within the bandwidth for much of the motion."""
+    """Periods per revolution whose ripple is within the bandwidth for much of the time in which it moves: at
+    rest any torque is a fast ripple's.
+    """
     spread = _spread(c.position)
     if spread <= 0.0:
         return np.array([])
     least = least_periods(c.position)
-    slow = float(np.quantile(np.abs(c.velocity), 0.4))
+    motor = [own is c for own in frame.motors].index(True)
+    speed = np.abs(c.velocity)
+    moves = speed > choice("sure") * frame.signals.velocity_noise(motor)
+    slow = float(np.quantile(speed[moves], 0.4)) if np.any(moves) else np.inf
     most = 2.0 * np.pi * frame.signals.bandwidth_hz / max(slow, 1e-12)
     step = np.pi / spread
     count = int(np.clip((most - least) / step, 0, ripples))
     # Once and twice a turn of the output and of the motor, where the motion has a whole period.
-    gear = frame.model.motors[[own is c for own in frame.motors].index(True)].gear_ratio
+    gear = frame.model.motors[motor].gear_ratio
     turns = np.array([1.0, 2.0] if gear is None else [1.0, 2.0, gear, 2.0 * gear])
     turns = turns[(turns * spread >= 2.0 * np.pi) & (turns <= most)]
     return np.concatenate((turns, least + step * np.arange(count)))

@@ -162,18 +162,25 @@ def stamped_wrongly(name: str, delay_s: float, period_s: float) -> str | None:
 
 
 def alignment_of(
-    problem: Problem, after: Fitted, effects: list[Finding], surplus: float
+    problem: Problem,
+    after: Fitted,
+    effects: list[Finding],
+    surplus: float,
+    transmissions: Sequence[Refitted],
 ) -> dict[str, tuple[float, float]]:
     """Return everyday corrections of the readings with their standard deviations, by channel.
 
-    A constant torque of a flexible joint may as well be a zero of its encoders: it is none.
+    A constant torque of a flexible joint may as well be a zero of its encoders: it is taken for one, as in a
+    fit.
     """
     flexible = problem.frames[0].flexible
     named = {(f.name, f.motor) for f in effects}
     pairs: dict[str, tuple[float, float]] = {}
-    std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, after, surplus)), 0.0))
-    for slot, x, sigma in zip(after.slots, after.posterior.x, std, strict=True):
-        value = slot.taken + float(x)
+    covariance = hac_covariance(problem, after, surplus)
+    totals = after.posterior.x + np.array([slot.taken for slot in after.slots])
+    zeros = _constants_as_zeros(problem, after, transmissions)
+    totals, std = zeros @ totals, np.sqrt(np.maximum(np.diag(zeros @ covariance @ zeros.T), 0.0))
+    for slot, value, sigma in zip(after.slots, totals.tolist(), std.tolist(), strict=True):
         if abs(value) < choice("sure") * sigma or stamped_wrongly(slot.name, value, problem.period_s):
             continue
         if (
@@ -183,10 +190,23 @@ def alignment_of(
         ):
             continue
         if slot.name == "encoder_delay":
-            pairs["link_position_delay_s"] = value, float(sigma)
+            pairs["link_position_delay_s"] = value, sigma
         elif slot.name in _CHANNELS and (slot.name != "torque_offset" or not flexible[slot.motor or 0]):
-            pairs[f"motor{(slot.motor or 0) + 1}_{_CHANNELS[slot.name]}"] = value, float(sigma)
+            pairs[f"motor{(slot.motor or 0) + 1}_{_CHANNELS[slot.name]}"] = value, sigma
     return pairs
+
+
+def _constants_as_zeros(problem: Problem, after: Fitted, transmissions: Sequence[Refitted]) -> FloatArray:
+    """(k, k) what adds a motor's constant torque to the zero of its encoders where nothing ties either, and
+    the stiffness is known.
+    """
+    made, frame = np.eye(len(after.slots)), problem.at(after.corrections, after.base)[0]
+    own = {(s.name, s.motor, s.run): j for j, s in enumerate(after.slots) if s.kind == "everyday"}
+    for (name, motor, run), j in own.items() if not frame.linked else ():
+        zero = own.get(("deflection_offset", motor, run))
+        if name == "torque_offset" and zero is not None and transmissions[motor or 0].parameters:
+            made[zero, j] = 1.0 / float(np.mean(frame.motors[motor or 0].stiffness))
+    return made
 
 
 def transmissions_of(

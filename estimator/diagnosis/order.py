@@ -1,4 +1,6 @@
-"""Polynomials of open order: a higher order is part of the model, not a missing effect."""
+"""What a joint file leaves open of its laws, which is no missing effect: a polynomial's order, and over which
+velocity dry friction changes its sign.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +9,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from estimator.choices import choice
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Finding
+from estimator.effects import open_smoothing, sharpened
 from estimator.model import HIGHEST_ORDER, JointModel, Transmission
 from estimator.ranges import range_of
 
-__all__ = ["bends", "ordered", "ordered_beside"]
+__all__ = ["bends", "ordered", "ordered_beside", "sharp"]
 
 Make = Callable[[JointModel, Problem | None], Problem]
 _CURVES = ("higher_order_stiffness", "backlash")  # odd, as a polynomial is
@@ -31,6 +35,23 @@ def bends(model: JointModel, effects: Iterable[Finding]) -> bool:
         and _is_open(model.motors[f.motor or 0].transmission)
         for f in effects
     )
+
+
+def sharp(model: JointModel, make: Make) -> float | None:
+    """Return over which velocity declared dry friction changes its sign, rad/s: the default, or what noise
+    resolves and softer steps, whichever explains most; None: nothing is left out.
+
+    A motor at rest is held by any torque up to its friction, which a smoother law does not have.
+    """
+    if not open_smoothing(model):
+        return None
+    problem = make(model, None)
+    steps = problem.smoothing_rad_s * choice("softer") ** np.linspace(0.0, 2.0, 5)
+    fits = {None: problem.null()} | {
+        float(one): make(sharpened(model, float(one)), problem).null() for one in steps if one > 0.0
+    }
+    closest = min(fits.values(), key=lambda h: float(np.sum(np.log(h.posterior.sigma))))
+    return max(fits, key=lambda one: fits[one].evidence(closest))
 
 
 def ordered(model: JointModel, make: Make) -> tuple[Problem, Fitted]:

@@ -163,6 +163,8 @@ class Diagnosis:
         recordings: errors of each recording.
         stiffness: of each flexible transmission, before and after.
         surplus: mean square of the errors on held-out data over that on the fitted data, at least 1.
+        smoothing_rad_s: over which declared dry friction changes its sign, where the joint file leaves it
+            out and another velocity than the default explains more.
     """
 
     verdict: Verdict
@@ -182,3 +184,4 @@ class Diagnosis:
     recordings: tuple[RecordingErrors, ...] = ()
     stiffness: tuple[StiffnessCurve, ...] = ()
     surplus: float = 1.0
+    smoothing_rad_s: float | None = None

@@ -158,7 +158,7 @@ class Judge:
             unsure = ["no stiffness is reported: what is unexplained is in the spring's torque or deflection"]
         sides = self._sides(before, after) if judged.verdict in ("effect", "unexplained") else []
         notes = [*judged.notes, *unsure, *self._doubts(effects), *sides, *problem.clipped, *wider(surplus)]
-        aligned = alignment_of(problem, after, effects, surplus)
+        aligned = alignment_of(problem, after, effects, surplus, transmissions)
         return Diagnosis(
             verdict=judged.verdict,
             bandwidth_hz=problem.bandwidth_hz,

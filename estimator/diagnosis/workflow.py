@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from estimator.choices import least_rows
 from estimator.diagnosis.bandwidth import choose_bandwidth, widest
 from estimator.diagnosis.heldout import Held, held_out
-from estimator.diagnosis.order import bends, ordered_beside
+from estimator.diagnosis.order import bends, ordered_beside, sharp
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.verdict import Judge
+from estimator.effects import sharpened
 from estimator.errors import EstimatorError
 from estimator.gate import check, without_hold
 from estimator.model import JointModel
@@ -66,6 +68,8 @@ def diagnose(
         judge = Judge(search, search.run(), progress)
         return judge, judge.diagnosis()
 
+    smoothing_rad_s = sharp(model, made)
+    model = sharpened(model, smoothing_rad_s)
     judge, outcome = judged(made(model))
     tried = [_orders(judge.problem.model)]
     while bends(model, outcome.effects):
@@ -77,7 +81,7 @@ def diagnose(
         if judge.held.confirms(judge.found, other.found, other.held):
             break
         judge, outcome = other, raised
-    return outcome
+    return replace(outcome, smoothing_rad_s=smoothing_rad_s)
 
 
 def _orders(model: JointModel) -> list[int]:

@@ -19,6 +19,7 @@ from estimator.diagnosis.findings import DELAYS, stamped_wrongly
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.heldout import Held, held_out
 from estimator.diagnosis.hypothesis import Fitted
+from estimator.diagnosis.misdeclared import believed
 from estimator.diagnosis.order import ordered, sharp
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.search import Search
@@ -192,7 +193,8 @@ def fit_joint(
 
     bare = _bare(model)
     smoothing_rad_s = sharp(bare, made)
-    problem, fitted = ordered(sharpened(bare, smoothing_rad_s), made)
+    bare = believed(sharpened(bare, smoothing_rad_s), made)
+    problem, fitted = ordered(bare, made)
     held = held_out(problem)
     search = Search(problem, held, null=fitted)
     surplus = held.surplus(fitted)

@@ -9,12 +9,12 @@ import numpy as np
 from scipy.special import chdtrc
 
 from estimator.batch import JointFit, TransmissionFit, fit_joint, transmission_fits
-from estimator.choices import chance
+from estimator.choices import chance, choice
 from estimator.diagnosis.candidates import sign_smoothing
 from estimator.diagnosis.heldout import Residual, residual_of, wider
+from estimator.diagnosis.misdeclared import moved_link
 from estimator.effects import elements, sharpened
 from estimator.model import Effect, JointModel, LinkDynamics, Motor, Transmission
-from estimator.ranges import range_of
 from estimator.sample import Record
 from estimator.transmissions import RIGID
 
@@ -81,6 +81,7 @@ def identify(
         for i, (motor, one) in enumerate(zip(model.motors, fits, strict=True))
     )
     link, link_std = _link(joint, notes)
+    notes += _asked_for(link, model.link) if link is not None and model.link is not None else []
     notes += _believed(joint, model)
     link_effects = model.link_effects
     if all(one.excited for motor, one in zip(model.motors, fits, strict=True) if motor.flexible):
@@ -175,38 +176,47 @@ def _link(joint: JointFit, notes: list[str]) -> tuple[LinkDynamics | None, dict[
     if link is None or not joint.places(("link_inertia", None)):
         return link, {}
     inertia, inertia_std = joint.mean("link_inertia", None)
-    if link.inertia_kg_m2 + inertia < range_of("inertia_kg_m2").least:
+    damping, damping_std = joint.mean("link_viscous_damping", None)
+    moved = moved_link(link, inertia, damping, tuple(joint.values(("gravity", None)).tolist()))
+    if moved is None:
         notes.append(
             "the link's balance leaves no inertia above 0: its dynamics are kept as declared; "
             "check sign and unit of the link position"
         )
         return link, {}
-    damping, damping_std = joint.mean("link_viscous_damping", None)
     std = {"inertia_kg_m2": inertia_std, "viscous_damping_nm_s_rad": damping_std}
-    link = replace(
-        link,
-        inertia_kg_m2=link.inertia_kg_m2 + inertia,
-        viscous_damping_nm_s_rad=max(link.viscous_damping_nm_s_rad + damping, 0.0),
-        inertia_std_kg_m2=inertia_std,
-        viscous_damping_std_nm_s_rad=damping_std,
-    )
+    link = replace(moved, inertia_std_kg_m2=inertia_std, viscous_damping_std_nm_s_rad=damping_std)
     if gravity:
-        parts = joint.values(("gravity", None))
-        a = link.gravity_nm * math.cos(link.gravity_phase_rad) + float(parts[0])
-        b = link.gravity_nm * math.sin(link.gravity_phase_rad) + float(parts[1])
-        sign = -1.0 if link.gravity_nm < 0.0 else 1.0
-        size = max(math.hypot(a, b), 1e-300)
+        size, phase = max(abs(link.gravity_nm), 1e-300), link.gravity_phase_rad
         both = joint.covariance[np.ix_(gravity, gravity)]
-        along, across = np.array([a, b]) / size, np.array([-b, a]) / size**2
+        along = np.array([math.cos(phase), math.sin(phase)])
+        across = np.array([-math.sin(phase), math.cos(phase)]) / size
         std["gravity_nm"] = math.sqrt(max(float(along @ both @ along), 0.0))
         std["gravity_phase_rad"] = math.sqrt(max(float(across @ both @ across), 0.0))
-        link = replace(
-            link,
-            gravity_nm=sign * size,
-            gravity_phase_rad=math.atan2(sign * b, sign * a),
-            gravity_std_nm=max(std["gravity_nm"], size * std["gravity_phase_rad"]),
-        )
+        link = replace(link, gravity_std_nm=max(std["gravity_nm"], size * std["gravity_phase_rad"]))
     return link, std
+
+
+def _asked_for(found: LinkDynamics, declared: LinkDynamics) -> list[str]:
+    """Say which link dynamics are further from the declared ones than a declaration is."""
+
+    def gravity(link: LinkDynamics) -> complex:
+        return link.gravity_nm * complex(math.cos(link.gravity_phase_rad), math.sin(link.gravity_phase_rad))
+
+    off = (
+        abs(found.inertia_kg_m2 - declared.inertia_kg_m2),
+        abs(found.viscous_damping_nm_s_rad - declared.viscous_damping_nm_s_rad),
+        abs(gravity(found) - gravity(declared)),
+    )
+    names = (("inertia_kg_m2",), ("viscous_damping_nm_s_rad",), ("gravity_nm", "gravity_phase_rad"))
+    lines = [
+        f"{name} = {getattr(found, name):.4g} (now {getattr(declared, name):.4g})"
+        for each, more, std, left in zip(names, off, declared.std, found.std, strict=True)
+        for name in each
+        if more > choice("sure") * math.hypot(std, left)
+    ]
+    wrong = "the declared link dynamics are not those of these recordings: [link.dynamics] should have"
+    return [f"{wrong} {', '.join(lines)}"] if lines else []
 
 
 def _recordings(joint: JointFit) -> tuple[RecordingFit, ...]:

@@ -1,6 +1,7 @@
 """Batch fits of whole recordings: known truth found again, with intervals that mean something."""
 
 import json
+from dataclasses import replace
 
 import diagnosiskit as kit
 import fleetkit
@@ -241,3 +242,18 @@ def test_a_link_of_which_only_its_declaration_tells_keeps_its_inertia_and_the_st
     found = identify(joints.recorded(theta, torque, q), model)
     assert found.model.link.inertia_kg_m2 == pytest.approx(link, rel=0.03)
     assert found.fits[0].parameters["k_nm_rad"] == pytest.approx(stiffness, rel=0.03)
+
+
+@pytest.mark.parametrize("wrong", [{"inertia_kg_m2": 0.01}, {"inertia_kg_m2": 100.0}, {"gravity_nm": 0.0}])
+def test_link_dynamics_that_are_declared_wrong_by_any_factor_are_found_and_said(wrong):
+    (record,) = kit.World([{}]).run()
+    model = kit.model()
+    off = {name: factor * getattr(model.link, name) for name, factor in wrong.items()}
+    found = identify(record, replace(model, link=replace(model.link, **off)))
+    assert found.model.link.inertia_kg_m2 == pytest.approx(kit.LINK_INERTIA, rel=0.01)
+    assert found.model.link.gravity_nm == pytest.approx(kit.GRAVITY, rel=0.01)
+    assert found.fits[0].parameters["k_nm_rad"] == pytest.approx(kit.STIFFNESS, rel=0.01)
+    (name, value) = next(iter(off.items()))
+    (said,) = (note for note in found.notes if "[link.dynamics] should have" in note)
+    assert f"{name} = {getattr(found.model.link, name):.4g} (now {value:.4g})" in said
+    assert not [note for note in identify(record, model).notes if "[link.dynamics]" in note]

@@ -25,7 +25,8 @@ _AT_MOTOR = (
     "torque_delay",
     "deflection_offset",
 )
-_AT_LINK = ("encoder_delay", "link_inertia", "link_viscous_damping", "gravity")
+_OF_LINK = ("link_inertia", "link_viscous_damping", "gravity")
+_AT_LINK = ("encoder_delay", *_OF_LINK)
 
 
 def everyday(frame: Frame) -> list[Candidate]:
@@ -110,15 +111,15 @@ def _of_link_std(
 ) -> tuple[float, ...]:
     """Of inertia, damping and gravity of the link."""
     name, link = candidate.kind.name, frame.model.link
-    std = _declared_std(frame, name, calibrating)
     if link is None:
         return (0.0,)
-    if name == "link_inertia":
-        return (std * link.inertia_kg_m2,)
-    if name == "link_viscous_damping":
-        return (std * link.viscous_damping_nm_s_rad,)
+    share, place = _declared_std(frame, name, calibrating), _OF_LINK.index(name)
+    value = (link.inertia_kg_m2, link.viscous_damping_nm_s_rad, abs(link.gravity_nm))[place]
+    std = max(share * value, link.std[place] if calibrating else 0.0)
+    if name != "gravity":
+        return (std,)
     unknown = PRIORS["effect"].std * torque_rms if calibrating and frame.carried else 0.0
-    return (float(np.hypot(std * link.gravity_nm, unknown)),) * 2
+    return (float(np.hypot(std, unknown)),) * 2
 
 
 def _declared_std(frame: Frame, name: str, calibrating: bool) -> float:

@@ -7,7 +7,7 @@ readings, friction of a rigid joint) are kept only if the data support them.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -19,17 +19,17 @@ from estimator.diagnosis.findings import DELAYS, stamped_wrongly
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.heldout import Held, held_out
 from estimator.diagnosis.hypothesis import Fitted
-from estimator.diagnosis.misdeclared import believed
-from estimator.diagnosis.order import ordered, sharp
+from estimator.diagnosis.misdeclared import asked_for, believed
+from estimator.diagnosis.order import bare, ordered, sharp
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.effects import sharpened
 from estimator.errors import EstimatorError
 from estimator.gate import check, without_hold
-from estimator.model import JointModel, ParameterValue, Transmission
+from estimator.model import JointModel, ParameterValue
 from estimator.sample import SIGMA_95, FloatArray, Record
-from estimator.transmissions import MODELS, RIGID, UNKNOWN, TransmissionModel
+from estimator.transmissions import MODELS, RIGID, TransmissionModel
 
 _OF_RIGID = ("coulomb_friction", "torque_offset")
 _NUISANCES = {  # everyday errors by the names of `TransmissionFit.nuisance_std`
@@ -179,7 +179,7 @@ def fit_joint(
     usable = [_whole(one, model) for one in records]
     for one in usable:
         check(one, model)
-    model = without_hold(usable, model)
+    model = asked_for(usable, without_hold(usable, model))
     if bandwidth_rad_s is None:
         bandwidth_hz = choose_bandwidth(usable, model)
     else:
@@ -191,10 +191,9 @@ def fit_joint(
     def made(model: JointModel, like: Problem | None) -> Problem:
         return _joint_problem(usable, model, bandwidth_hz, like)
 
-    bare = _bare(model)
-    smoothing_rad_s = sharp(bare, made)
-    bare = believed(sharpened(bare, smoothing_rad_s), made)
-    problem, fitted = ordered(bare, made)
+    open_ = bare(model)
+    smoothing_rad_s = sharp(open_, made)
+    problem, fitted = ordered(believed(sharpened(open_, smoothing_rad_s), made), made)
     held = held_out(problem)
     search = Search(problem, held, null=fitted)
     surplus = held.surplus(fitted)
@@ -226,16 +225,6 @@ def _whole(record: Record, model: JointModel) -> Record:
         good &= np.isfinite(record.link_position_rad)
 
     return record if np.all(good) else record.rows(good)
-
-
-def _bare(model: JointModel) -> JointModel:
-    """The joint without transmission parameters."""
-
-    def open_(own: Transmission) -> Transmission:
-        name = "polynomial" if own.model == UNKNOWN else own.model
-        return replace(own, model=name, parameters={}, covariance=None)
-
-    return replace(model, motors=tuple(replace(m, transmission=open_(m.transmission)) for m in model.motors))
 
 
 def _aligned(free: JointFit) -> JointFit:

@@ -15,7 +15,7 @@ from estimator.diagnosis.heldout import Residual, residual_of, wider
 from estimator.diagnosis.misdeclared import moved_link
 from estimator.effects import elements, sharpened
 from estimator.model import Effect, JointModel, LinkDynamics, Motor, Transmission
-from estimator.sample import Record
+from estimator.sample import SIGMA_95, Record
 from estimator.transmissions import RIGID
 
 _PARAMETER = {
@@ -81,6 +81,14 @@ def identify(
         for i, (motor, one) in enumerate(zip(model.motors, fits, strict=True))
     )
     link, link_std = _link(joint, notes)
+    pairs = zip(motors, joint.problem.model.motors, model.motors, strict=True)
+    notes += [
+        f"the declared inertia of motor {i} is not that of these recordings: [[motor]] should have "
+        f"inertia_kg_m2 = {one.inertia_kg_m2:.4g} ± {SIGMA_95 * fits[i - 1].nuisance_std['inertia']:.2g}, "
+        f"95 % (now {declared.inertia_kg_m2:.4g})"
+        for i, (one, used, declared) in enumerate(pairs, start=1)
+        if used.inertia_kg_m2 != declared.inertia_kg_m2
+    ]
     notes += _asked_for(link, model.link) if link is not None and model.link is not None else []
     notes += _believed(joint, model)
     link_effects = model.link_effects

@@ -15,6 +15,8 @@ from drivelink.cli import main
 from drivelink.output import plots
 from drivelink.output.fitreport import fit_plot
 from estimator import EstimatorError, JointModel, LinkDynamics, Motor, Status, Transmission, fit
+from estimator.diagnosis import diagnose
+from estimator.gate import judge
 from estimator.identify import identify
 from estimator.transmissions import MODELS
 
@@ -257,3 +259,18 @@ def test_link_dynamics_that_are_declared_wrong_by_any_factor_are_found_and_said(
     (said,) = (note for note in found.notes if "[link.dynamics] should have" in note)
     assert f"{name} = {getattr(found.model.link, name):.4g} (now {value:.4g})" in said
     assert not [note for note in identify(record, model).notes if "[link.dynamics]" in note]
+
+
+@pytest.mark.parametrize("factor", [0.01, 5.0])
+def test_a_motor_inertia_that_is_declared_wrong_by_any_factor_is_found_said_and_never_sufficient(factor):
+    (record,) = kit.World([{}]).run()
+    model = kit.model(linked=False)
+    (motor,) = model.motors
+    wrong = replace(model, motors=(replace(motor, inertia_kg_m2=factor * motor.inertia_kg_m2),))
+    assert judge(record, wrong).inertia[0] == pytest.approx(1.0 / factor, rel=0.3)
+    assert not judge(record, model).inertia
+    found = identify(record, wrong)
+    assert found.model.motors[0].inertia_kg_m2 == pytest.approx(kit.INERTIA, rel=0.02)
+    assert found.fits[0].parameters["k_nm_rad"] == pytest.approx(kit.STIFFNESS, rel=0.02)
+    assert any("[[motor]] should have inertia_kg_m2 = 0.1" in note for note in found.notes)
+    assert diagnose(record, wrong).verdict != "sufficient"

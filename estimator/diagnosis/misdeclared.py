@@ -1,8 +1,9 @@
-"""Link dynamics that are declared wrong by any factor: a competitor of those that are declared."""
+"""Inertias and gravity that are declared wrong by any factor: competitors of those that are declared."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,11 +13,39 @@ from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.law_parameters import start, with_flexibility
 from estimator.diagnosis.order import Make
 from estimator.diagnosis.problem import Problem
+from estimator.gate import judge
 from estimator.model import JointModel, LinkDynamics
 from estimator.priors import PRIORS
 from estimator.ranges import range_of
+from estimator.sample import Record
 
-__all__ = ["believed", "moved_link"]
+__all__ = ["asked_for", "asks", "believed", "moved_link"]
+
+
+def asked_for(records: Sequence[Record], model: JointModel) -> JointModel:
+    """Return the joint with the motors' inertias that the gate says all recordings ask for, as widely known
+    as one that was declared wrong; the torque is the anchor then.
+    """
+    each = asks(records, model)
+    if not all(each):
+        return model
+    factors = np.exp(np.mean(np.log(each), axis=0)).tolist()
+    motors = tuple(
+        motor
+        if factor == 1.0
+        else replace(
+            motor,
+            inertia_kg_m2=factor * motor.inertia_kg_m2,
+            inertia_std_relative=PRIORS["anchor"].std,
+        )
+        for motor, factor in zip(model.motors, factors, strict=True)
+    )
+    return replace(model, motors=motors)
+
+
+def asks(records: Sequence[Record], model: JointModel) -> list[tuple[float, ...]]:
+    """Return which share of the motors' declared inertias each recording asks for (`Judgement.inertia`)."""
+    return [judge(one, model).inertia for one in records]
 
 
 def believed(model: JointModel, make: Make) -> JointModel:

@@ -17,8 +17,9 @@ from estimator.diagnosis.result import Finding
 from estimator.effects import open_smoothing, sharpened
 from estimator.model import HIGHEST_ORDER, JointModel, Transmission
 from estimator.ranges import range_of
+from estimator.transmissions import UNKNOWN
 
-__all__ = ["bends", "ordered", "ordered_beside", "sharp"]
+__all__ = ["bare", "bends", "ordered", "ordered_beside", "sharp"]
 
 Make = Callable[[JointModel, Problem | None], Problem]
 _CURVES = ("higher_order_stiffness", "backlash")  # odd, as a polynomial is
@@ -34,6 +35,18 @@ def bends(model: JointModel, effects: Iterable[Finding]) -> bool:
         (f.name in _CURVES or f.coordinates[:1] == ("deflection",))
         and _is_open(model.motors[f.motor or 0].transmission)
         for f in effects
+    )
+
+
+def bare(model: JointModel) -> JointModel:
+    """Return the joint without transmission parameters."""
+
+    def without(own: Transmission) -> Transmission:
+        name = "polynomial" if own.model == UNKNOWN else own.model
+        return replace(own, model=name, parameters={}, covariance=None)
+
+    return replace(
+        model, motors=tuple(replace(m, transmission=without(m.transmission)) for m in model.motors)
     )
 
 

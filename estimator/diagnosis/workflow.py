@@ -8,6 +8,7 @@ from dataclasses import replace
 from estimator.choices import least_rows
 from estimator.diagnosis.bandwidth import choose_bandwidth, widest
 from estimator.diagnosis.heldout import Held, held_out
+from estimator.diagnosis.misdeclared import asks
 from estimator.diagnosis.order import bends, ordered_beside, sharp
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Diagnosis
@@ -81,7 +82,10 @@ def diagnose(
         if judge.held.confirms(judge.found, other.found, other.held):
             break
         judge, outcome = other, raised
-    return replace(outcome, smoothing_rad_s=smoothing_rad_s)
+    outcome = replace(outcome, smoothing_rad_s=smoothing_rad_s)
+    if outcome.verdict == "sufficient" and any(asks(records, model)):
+        return replace(outcome, verdict="insufficient_excitation")
+    return outcome
 
 
 def _orders(model: JointModel) -> list[int]:

@@ -97,12 +97,15 @@ class Judgement:
         undecided: units and signs that this motion does not reveal, in words; empty if there are findings.
         reason: why nothing can be decided at all, or empty.
         left: residual of the corrected balance over the torque.
+        inertia: of each motor, as a share of the declared one, where the motion decisively asks for another;
+            else empty.
     """
 
     findings: tuple[Discrepancy, ...] = ()
     undecided: tuple[str, ...] = ()
     reason: str = ""
     left: float = math.nan
+    inertia: tuple[float, ...] = ()
 
     @property
     def remark(self) -> str:
@@ -255,7 +258,7 @@ def _decided(
     certain = best - excuse >= _decisive() or all(cause.kind in ("unit", "gear", "period") for cause in found)
     if odds < _decisive() or not (blamed and certain) or after > choice("unexplained"):
         if found and not blamed and odds >= _decisive():
-            return Judgement(reason=_another_inertia(joint, weighed), left=after)
+            return _another_inertia(joint, weighed, after)
         if before > choice("unexplained"):
             reason = f"the motion explains {percent(1.0 - before, 0)} of the torque"
             if before > 1.0:
@@ -275,17 +278,20 @@ def _decided(
     return Judgement(findings=tuple(findings), left=after)
 
 
-def _another_inertia(joint: _Joint, weighed: list[tuple[float, tuple[Cause, ...]]]) -> str:
-    """That the motors' inertia is another than declared, and what else explains as much, in words."""
+def _another_inertia(joint: _Joint, weighed: list[tuple[float, tuple[Cause, ...]]], left: float) -> Judgement:
+    """That the motors' inertia is another than declared, and what else explains as much."""
     best, found = weighed[0]
-    factors = (
-        f.inertia * (1.0 if math.isinf(s.inertia) else s.inertia) for s, f in joint.fits(found).values()
-    )
+    each = {
+        i: f.inertia * (1.0 if math.isinf(s.inertia) else s.inertia)
+        for i, (s, f) in joint.fits(found).items()
+    }
+    factors = each.values()
     text = f"the motion asks for {' and '.join(f'{x:.2g}' for x in factors)} times the declared inertia"
     others = [h[0] for e, h in weighed if best - e < _decisive() and len(h) == 1 and h[0].kind != "inertia"]
     motors = joint.record.motors
     listed = " or ".join(_said(one.changes, one.what, motors) for one in others)
-    return f"{text} (or else: {listed})" if listed else text
+    asked = tuple(each[i] if scales(found, i).inertia != 1.0 else 1.0 for i in range(motors))
+    return Judgement(reason=f"{text} (or else: {listed})" if listed else text, left=left, inertia=asked)
 
 
 def _undecided(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple[str, ...]:

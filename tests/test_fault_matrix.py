@@ -48,6 +48,12 @@ def test_health_keeps_its_valid(joint):
     assert healthy.valid >= 0.999 * healthy.samples
 
 
+def test_spikes_are_left_out_also_where_the_motor_has_just_stood():
+    fault = next(f for f in matrix.FAULTS if f.name == "spikes 0.01" and f.signals == ("motor",))
+    outcome = matrix.outcome("quadratic", fault, 15.0, 15.0, 0)
+    assert outcome.valid == outcome.samples and not outcome.torque
+
+
 @pytest.mark.parametrize("share", [0.003, 0.01])
 def test_noise_that_begins_on_the_link_encoder_costs_neither_valid_nor_accuracy(share):
     """What the deflection filter has taken up before the noise is measured counts in its covariance."""

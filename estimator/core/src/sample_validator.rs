@@ -87,6 +87,7 @@ struct Memory {
     rejected: u32,
     motion: f64,
     frozen: bool,
+    stood_still: bool, // one that has jumped, before it did
 }
 
 const FRESH: Memory = Memory {
@@ -113,6 +114,7 @@ const FRESH: Memory = Memory {
     rejected: 0,
     motion: 0.0,
     frozen: false,
+    stood_still: false,
 };
 
 impl SampleValidator {
@@ -211,18 +213,22 @@ impl SampleValidator {
         let frozen = self.stands_still(&places, &sample.motor_torque);
         let first = self.memory.rejected == 0;
         let jumped = self.jumped(&places, periods as f64);
+        if jumped && first {
+            self.memory.stood_still = self.has_stood();
+        }
         if jumped && frozen {
             self.memory.slopes = [0.0; PLACES]; // the jump is that it stopped
         } else if jumped {
             self.memory.rejected += 1;
-            if was_frozen || first && self.has_stood() {
-                // It was the repeated value that was wrong.
+            if was_frozen {
+                // It was the frozen value that was wrong.
                 return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, None);
             }
             if self.memory.rejected < self.patience {
                 return rejected;
             }
-            let jumps = Some(self.jumps(&places, periods as f64));
+            // After a value that was repeated it goes on: no zero has moved.
+            let jumps = (!self.memory.stood_still).then(|| self.jumps(&places, periods as f64));
             return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, jumps);
         }
         let m = &mut self.memory;

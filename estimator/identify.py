@@ -89,7 +89,7 @@ def identify(
         for i, (one, used, declared) in enumerate(pairs, start=1)
         if used.inertia_kg_m2 != declared.inertia_kg_m2
     ]
-    notes += _asked_for(link, model.link) if link is not None and model.link is not None else []
+    notes += _link_to_paste(link, model.link) if link is not None and model.link is not None else []
     notes += _believed(joint, model)
     link_effects = model.link_effects
     if all(one.excited for motor, one in zip(model.motors, fits, strict=True) if motor.flexible):
@@ -205,7 +205,7 @@ def _link(joint: JointFit, notes: list[str]) -> tuple[LinkDynamics | None, dict[
     return link, std
 
 
-def _asked_for(found: LinkDynamics, declared: LinkDynamics) -> list[str]:
+def _link_to_paste(found: LinkDynamics, declared: LinkDynamics) -> list[str]:
     """Say which link dynamics are further from the declared ones than a declaration is."""
 
     def gravity(link: LinkDynamics) -> complex:

@@ -41,8 +41,9 @@ pub struct Accepted {
 /// start anew from there. After a gap a place that no velocity seen so far leads to is a jump, too. A torque
 /// may jump, but one that would throw the bare motor about and is many times the largest one seen is left
 /// out unless it persists. A channel is frozen when it repeats itself exactly for three times as long as
-/// between two changes in the first motion, while a position moves; a position only if it stopped dead, sooner than friction can: a link
-/// that comes to rest while the motors go on, as under a controller, is no fault, nor is a motor that friction stops.
+/// between two changes in the first motion, while a position moves; a position only if it stopped dead, sooner
+/// than friction can: a link that comes to rest while the motors go on, as under a controller, is no fault, nor
+/// is a motor that friction stops. One that jumps after it has repeated itself so has not moved its zero.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SampleValidator {
     #[serde(deserialize_with = "crate::sample::motors")]
@@ -211,25 +212,11 @@ impl SampleValidator {
         self.review();
         let was_frozen = self.memory.frozen;
         let frozen = self.stands_still(&places, &sample.motor_torque);
-        let first = self.memory.rejected == 0;
-        let jumped = self.jumped(&places, periods as f64);
-        if jumped && first {
-            self.memory.stood_still = self.has_stood();
-        }
-        if jumped && frozen {
+        if self.jumped(&places, periods as f64) {
+            if !frozen {
+                return self.left_out(sample.sequence, places, periods, was_frozen);
+            }
             self.memory.slopes = [0.0; PLACES]; // the jump is that it stopped
-        } else if jumped {
-            self.memory.rejected += 1;
-            if was_frozen {
-                // It was the frozen value that was wrong.
-                return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, None);
-            }
-            if self.memory.rejected < self.patience {
-                return rejected;
-            }
-            // After a value that was repeated it goes on: no zero has moved.
-            let jumps = (!self.memory.stood_still).then(|| self.jumps(&places, periods as f64));
-            return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, jumps);
         }
         let m = &mut self.memory;
         (m.sequence, m.places) = (Some(sample.sequence), places);
@@ -244,6 +231,21 @@ impl SampleValidator {
             frozen,
             ..Accepted::default()
         }
+    }
+
+    /// A position that jumps is left out until the new place persists.
+    fn left_out(&mut self, sequence: u64, places: [f64; PLACES], periods: i64, was_frozen: bool) -> Accepted {
+        if self.memory.rejected == 0 {
+            self.memory.stood_still = self.has_stood();
+        }
+        self.memory.rejected += 1;
+        if !was_frozen && self.memory.rejected < self.patience {
+            return Accepted { status: status::INPUT_REJECTED, ..Accepted::default() };
+        }
+        // After a value that was frozen, or repeated, it goes on: no zero has moved.
+        let moved = !was_frozen && !self.memory.stood_still;
+        let jumps = moved.then(|| self.jumps(&places, periods as f64));
+        self.begin(sequence, places, status::INPUT_REJECTED | status::RESTARTED, jumps)
     }
 
     fn places(&self, sample: &Sample) -> [f64; PLACES] {

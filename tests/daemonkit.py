@@ -15,7 +15,7 @@ from drivelink._core import Tick
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint
-from drivelink.jointfile import JointFile, parse
+from drivelink.jointfile import JointFile, fingerprint, parse, read_text
 from estimator.sample import Estimate, Sample
 from sim.faults import Faults
 from sim.network import Network
@@ -92,8 +92,9 @@ class DaemonRig:
         self.bus = open_sim_bus(joint.bus)
         self.network: Network = network_from_joint(joint, self.bus)
         self.faults = Faults(self.network)
+        known = fingerprint(read_text(path)) if path else ""
         self.daemon = Daemon(
-            [ServedJoint(joint=joint, path=path, **options)],
+            [ServedJoint(joint=joint, path=path, fingerprint=known, **options)],
             publish=False,
             real_time=False,
             devices=self.network.poll,

@@ -137,6 +137,7 @@ def rewrite(path: Path, old: str, new: str) -> None:
 
 
 IN_USE = "elbow.toml: the model in it is now in use"
+NOT_YET = "elbow.toml: edited, not in use yet"
 
 
 def test_accepting_a_model_and_undoing_it_lose_no_cycle(reloadable, tmp_path, monkeypatch):
@@ -236,7 +237,7 @@ def test_a_flood_of_reloads_begins_one_in_a_while_and_forgets_none(reloadable, m
     monkeypatch.setattr(reload, "time", clock)
     (reloader,) = made.daemon._reloaders
     monkeypatch.setattr(
-        reloader, "_prepare", lambda: begun.append(now_s) or setattr(reloader, "_thread", None)
+        reloader, "_prepare", lambda _asked: begun.append(now_s) or setattr(reloader, "_thread", None)
     )
     for k in range(300):  # 30 a second, for ten seconds
         now_s = 1000.0 + k / 30
@@ -267,12 +268,37 @@ def test_what_needs_a_restart_is_said_beside_what_the_daemon_was_started_with(tm
     with rig(moved(load(path), options), path, move=partial(moved, args=options)) as made:
         (reloader,) = made.daemon._reloaders
         changed = text.replace('"kept"', '"box"').replace("node_id = 3", "node_id = 4")
-        for content in (changed, text):
+        said = "elbow.toml: recording, link.encoder changed, which requires a restart of the daemon"
+        for content, stands in ((changed, [said]), (text, [])):
             path.write_text(content, encoding="utf-8")
             taken(reloader)
             until(lambda: made.run(20) and reloader._thread is None)
-        said = "elbow.toml: recording, link.encoder changed, which requires a restart of the daemon"
-        assert made.events == [said, IN_USE]
+            assert made.status["conditions"] == stands
+        assert made.events == [NOT_YET, said, IN_USE, IN_USE]
+
+
+def test_whether_a_joint_file_is_in_use_is_told_by_its_text(reloadable, tmp_path, monkeypatch):
+    monkeypatch.setattr(reload, "load_apart", load)
+    path, (reloader,) = tmp_path / "elbow.toml", reloadable.daemon._reloaders
+    text = path.read_text(encoding="utf-8")
+    rewrite(path, "= 0.5,", "= 0.6,")  # while the daemon was starting
+    taken(reloader)
+    assert reloadable.status["conditions"] == [NOT_YET]
+    until(lambda: reloadable.run(20) and reloader._thread is None)
+    assert reloadable.status["conditions"] == [] and reloader._joint == load(path)
+    stamps = path.stat()
+    rewrite(path, "= 0.6,", "= 0.7,")  # of the same size, and then with the same time
+    os.utime(path, ns=(stamps.st_atime_ns, stamps.st_mtime_ns))
+    taken(reloader)
+    assert reloadable.status["conditions"] == [NOT_YET]
+    path.write_text(text, encoding="utf-8")  # a second edit before the first is in use
+    until(lambda: reloadable.run(20) and reloader._thread is None)
+    taken(reloader)
+    until(lambda: reloadable.run(20) and reloader._thread is None)
+    assert reloader._joint == load(path) and reloadable.events == [NOT_YET, IN_USE, IN_USE, IN_USE]
+    path.touch()
+    taken(reloader)
+    assert reloader._thread is None and reloadable.status["conditions"] == []
 
 
 def test_a_joint_file_that_is_gone_or_none_leaves_the_model_as_it_is(reloadable, tmp_path, monkeypatch):
@@ -297,15 +323,16 @@ def test_a_joint_file_that_is_gone_or_none_leaves_the_model_as_it_is(reloadable,
         path.write_bytes(content)
         taken(reloader)
         assert len(made.run(20)) == 20 and made.loop_joint.pipeline.estimator is old
-    assert len(made.events) == 8 and "name: expected elbow, as it was at the start" in made.events[-1]
-    assert all(text.startswith("the model stays as it is: ") and "elbow.toml" in text for text in made.events)
-    path.write_bytes(before)
+    said = [text for text in made.events if text != NOT_YET]
+    assert len(said) == 8 and "name: expected elbow, as it was at the start" in said[-1]
+    assert all(text.startswith("the model stays as it is: ") and "elbow.toml" in text for text in said)
+    path.write_bytes(before + b"\n")
     with monkeypatch.context() as broken:
         broken.setattr(reloader, "_build", lambda _joint: 1 // 0)
         taken(reloader)
     refused = "the model stays as it is: integer division or modulo by zero"
     assert made.events[-1] == refused and list(made.daemon.events.active.values()) == [refused]  # till mended
-    path.write_bytes(before + b"\n")
+    path.write_bytes(before + b"\n\n")
     taken(reloader)
     until(lambda: made.run(20) and made.loop_joint.pipeline.estimator is not old)
     assert not made.daemon.events.active

@@ -111,6 +111,7 @@ def test_a_view_without_anything_yet_says_so():
     view.update(Estimate(1, 0, *[math.nan] * 3, (TransmissionEstimate(*[math.nan] * 4),)), 1.0)
     assert "no values yet" in "\n".join(lines(view)) and "nan" not in view.line()
     view = filled()
+    assert view.line().endswith("node 2 reports a fault")  # where there are only plain lines, too
     view.status = {"state": "running"}  # no baseline: not a word of what is observable beside a green one
     text = "\n".join(lines(view, 120, 40))
     assert view.line().endswith("observable")  # and no comma after it, as in a replay

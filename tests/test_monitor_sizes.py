@@ -65,7 +65,8 @@ def test_more_joints_than_lines_are_counted_and_what_needs_a_look_comes_first():
     watcher = SimpleNamespace(views=views)
     console.print(_picture(watcher, console, "", 0.0))
     shown = console.export_text().rstrip("\n").split("\n")
-    assert len(shown) <= 24 and "joint-25" in shown[1] and "and 11 more" in "".join(shown)
+    assert len(shown) <= 24 and "joint-25" in shown[1] and "and 19 more" in "".join(shown)
+    assert sum(line.startswith("joint-") and line.endswith("node 2 reports a fault") for line in shown) == 8
 
 
 def test_a_rigid_joint_is_not_said_to_have_no_stiffness_yet():

@@ -16,7 +16,7 @@ from zenohkit import LIMIT_S, joint_text, ready, script, until
 
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.errors import ZenohError
-from drivelink.jointfile import ZenohSection, parse
+from drivelink.jointfile import ZenohSection, fingerprint, parse, read_text
 from drivelink.pubsub.clientbase import joints
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import FILES, close_session, daemon_config, open_client, open_session
@@ -230,8 +230,10 @@ def test_of_two_daemons_that_a_router_joins_later_each_says_that_there_is_anothe
     joint = vsa().model_copy(update={"zenoh": ZenohSection(config="alone.json5")})
     with ExitStack() as stack:
         stack.enter_context(served(joint))
+        (path := tmp_path / "j.toml").write_text(vsa_text(), encoding="utf-8")
+        known = fingerprint(read_text(path))
         daemon = stack.enter_context(
-            Daemon([ServedJoint(joint=joint, path=tmp_path / "j.toml")], real_time=False)
+            Daemon([ServedJoint(joint=joint, path=path, fingerprint=known)], real_time=False)
         )
         session = stack.enter_context(closing(open_session(joint.zenoh, tmp_path)))
         rival = JointPublisher(session, joint)  # neither sees the other

@@ -173,8 +173,9 @@ def _picture(
         view.help, view.footer = helping, "? legend · q ends"
     if len(views) == 1 or helping:
         return next(iter(views.values()))
-    alarms = [Text(f"{name}: {shape(view.status).advice}", style="bold red")
-              for name, view in views.items() if view.live and shape(view.status).alarm]  # fmt: skip
+    wrong = {name: shape(view.status or {}).look_here for name, view in views.items() if view.live}
+    alarms = [Text(f"{name}: {text}", "bold red", no_wrap=True, overflow="ellipsis")
+              for name, text in wrong.items() if text][: console.size.height // 3]  # fmt: skip
     footer = Text(
         "± is half the 95 % interval · drivelink monitor NAME: one joint with its curves · ? legend · q ends"
     )

@@ -17,7 +17,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from drivelink.cli import ALONE, add_bus, add_seconds, handling, moved
-from drivelink.jointfile import BusSection, load
+from drivelink.jointfile import BusSection, fingerprint, load_text
 from drivelink.plaintext import log_to_stderr, stamped
 
 if TYPE_CHECKING:
@@ -67,7 +67,8 @@ def run(args: argparse.Namespace) -> int:
     log_to_stderr(getattr(logging, args.log_level.upper()))
     logging.getLogger("canopen").setLevel(logging.ERROR)
     move = partial(moved, args=args)
-    loaded = [move(load(path)) for path in args.joints]
+    sources = [load_text(path) for path in args.joints]
+    loaded = [move(source.joint) for source in sources]
     if loaded[0].bus.interface == "virtual":
         logging.getLogger(__name__).warning(ALONE)
     from drivelink.cli.blackbox import black_box
@@ -75,8 +76,8 @@ def run(args: argparse.Namespace) -> int:
     from drivelink.pubsub.publisher import to_json
 
     joints = [
-        ServedJoint(joint=joint, path=path, move=move)
-        for joint, path in zip(loaded, args.joints, strict=True)
+        ServedJoint(joint=joint, path=source.path, fingerprint=fingerprint(source.text), move=move)
+        for joint, source in zip(loaded, sources, strict=True)
     ]
     with (
         _stopped_by_signals() as stopped,

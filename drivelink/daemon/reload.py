@@ -1,6 +1,7 @@
 """Replaces the model of the running loop without losing a cycle.
 
-When the joint file is rewritten, or on SIGHUP of a service manager, another process reads and validates it. A
+When the text of the joint file is another one, or on SIGHUP of a service manager, another process reads and
+validates it. Until it is in use, and for as long as it is not wholly so, a condition says that. A
 thread builds the new estimator and steps it through the last samples, so that it starts where the old one is;
 it holds neither the interpreter's lock nor one of the cycle's meanwhile. It is swapped in between two cycles.
 If the thread cannot catch up with the cycle, the cycle does the rest with more steps per slack than there are
@@ -13,12 +14,13 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from drivelink._core import JointPipeline
 from drivelink.cycle.pipeline import Built
 from drivelink.daemon.status import EventLog
 from drivelink.errors import DrivelinkError
-from drivelink.jointfile import JointFile
+from drivelink.jointfile import JointFile, fingerprint, read_text
 from drivelink.jointfile.apart import load_apart
 
 _EVERY_S = 1.0  # minimum time between two reloads, against repeated changes
@@ -33,6 +35,7 @@ class Reloader:
     """Watches one joint file and exchanges the estimator of its pipeline.
 
     Args:
+        known: fingerprint of the text that `joint` was read from.
         move: puts a joint file on the bus of the command line.
         build: makes estimator and model monitor of a joint file; called in a thread.
         publish: called with the new joint file after an exchange.
@@ -42,6 +45,7 @@ class Reloader:
         self,
         path: Path,
         joint: JointFile,
+        known: str,
         pipeline: JointPipeline,
         move: Callable[[JointFile], JointFile],
         build: Callable[[JointFile], Built],
@@ -49,14 +53,16 @@ class Reloader:
         events: EventLog,
     ) -> None:
         self.path = path
-        self._joint, self._fixed = joint, _fixed(joint)
+        self._joint, self._fixed, self._known = joint, _fixed(joint), known
         self._pipeline, self._history = pipeline, pipeline.history
         self._move, self._build = move, build
         self._publish = publish
         self._events = events
-        self._seen = self._signature()
+        self._seen: tuple[int, ...] | None = ()
         self._requested = False
-        self._refused = ""  # what is said of a file that is not in use
+        self._text = known  # fingerprint of what is read
+        self._standing = ""  # what holds of a file that is not, or not wholly, in use
+        self._restart = ""  # what of the file that is read requires a restart
         self._next_s = -math.inf
         self._thread: threading.Thread | None = None
         self._turn = threading.Lock()  # serialises the steps of the new estimator
@@ -67,10 +73,11 @@ class Reloader:
         """Reload even an unchanged file; callable from a signal handler."""
         self._requested = True
 
-    def close(self) -> JointFile:
-        """Cancel a reload that is under way; return the joint file in use."""
+    def close(self) -> dict[str, Any]:
+        """Cancel a reload that is under way; return the joint file in use, and its fingerprint."""
         self._thread = None
-        return self._joint
+        self._stand("")
+        return {"joint": self._joint, "fingerprint": self._known}
 
     def check(self) -> None:
         """Start a reload in the slack, if the file has changed."""
@@ -79,9 +86,9 @@ class Reloader:
         signature = self._signature()
         if signature == self._seen and not self._requested:
             return
-        self._seen, self._requested, self._slacks = signature, False, 0
+        asked, self._seen, self._requested, self._slacks = self._requested, signature, False, 0
         self._next_s = time.monotonic() + _EVERY_S
-        self._thread = threading.Thread(target=self._prepare, name="reload", daemon=True)
+        self._thread = threading.Thread(target=self._prepare, args=(asked,), name="reload", daemon=True)
         try:
             self._thread.start()
         except RuntimeError:  # the system has no more threads: in a second again
@@ -104,34 +111,43 @@ class Reloader:
             self._pipeline.exchange(estimator, model_monitor)
         finally:
             self._turn.release()
-        self._joint = joint
+        self._joint, self._known = joint, self._text
         self._publish(joint)
-        self._events.report(f"{self.path.name}: the model in it is now in use")
+        self._stand(self._restart)
+        self._events.report(f"{self.path.name}: the model in it is now in use", key=f"in use {self._text}")
 
     def _signature(self) -> tuple[int, int, int] | None:
         try:
             status = self.path.stat()
         except OSError:
             return None
-        return status.st_mtime_ns, status.st_size, status.st_ino
+        return status.st_ctime_ns, status.st_size, status.st_ino  # ctime: no program can set it
 
-    def _prepare(self) -> None:
+    def _prepare(self, asked: bool) -> None:
+        """Read the file, and make its estimator if its text is another one than that in use, or if asked."""
         try:
+            self._text = fingerprint(read_text(self.path))
+            if self._text == self._known and not asked:
+                self._stand(self._restart)
+                self._next_s, self._thread = -math.inf, None
+                return
+            self._stand(f"{self.path.name}: edited, not in use yet", logging.DEBUG)
             joint = self._move(load_apart(self.path))
             self._refuse_changes(joint)
             built = self._build(joint)
         except Exception as error:  # noqa: BLE001 - whatever comes of a file, the next one is read
-            self._refuse(f"the model stays as it is: {error}")
+            self._stand(f"the model stays as it is: {error}", logging.ERROR)
             self._thread = None
             return
-        self._events.end(self._refused)
         self._follow(joint, built)
 
-    def _refuse(self, text: str) -> None:
-        """Report why the file is not in use, for as long as it is so."""
-        self._events.end(self._refused)
-        self._refused = text
-        self._events.begin(text, text, logging.ERROR)
+    def _stand(self, text: str, level: int = logging.WARNING) -> None:
+        """Report what holds of the file until something else does; empty: it is in use."""
+        if text != self._standing:
+            self._events.end(self._standing)
+            self._standing = text
+            if text:
+                self._events.begin(text, text, level)
 
     def _follow(self, joint: JointFile, built: Built) -> None:
         """Step the new estimator through the kept samples, and on until the loop takes over."""
@@ -153,11 +169,8 @@ class Reloader:
             if getattr(joint, key) != (was := getattr(self._joint, key)):
                 raise DrivelinkError(f"{self.path.name}: {key}: expected {was}, as it was at the start")
         changed = [key for key, value in _fixed(joint).items() if self._fixed.get(key) != value]
-        if changed:
-            self._events.report(
-                f"{self.path.name}: {', '.join(changed)} changed, which requires a restart of the daemon",
-                logging.WARNING,
-            )
+        needs = f"{', '.join(changed)} changed, which requires a restart of the daemon"
+        self._restart = f"{self.path.name}: {needs}" if changed else ""
 
 
 def _fixed(joint: JointFile) -> dict[str, object]:

@@ -57,6 +57,7 @@ class ServedJoint:
 
     joint: JointFile
     path: Path | None = None  # its path; None: it cannot be reloaded and refers to no other files
+    fingerprint: str = ""  # of the text that was read; empty: not known, it is read again
     move: Callable[[JointFile], JointFile] = lambda joint: joint  # to the bus of the command line
 
     @property
@@ -180,7 +181,7 @@ class Daemon:
                 housekeeping.every(_FINDING_S, SnapshotFeed(loop_joint.pipeline, publisher).check)
         if served.path is not None:
             make: Callable[[JointFile], Built] = lambda joint: build(self._timed(joint))  # noqa: E731
-            files = served.path, served.joint
+            files = served.path, served.joint, served.fingerprint
             reloader = Reloader(
                 *files, loop_joint.pipeline, served.move, make, publish, self.events.of(joint.name)
             )
@@ -202,7 +203,7 @@ class Daemon:
         self.events.report(f"{text}: estimates begin anew with it", logging.WARNING)
         present = {reloader.path: reloader.close() for reloader in self._reloaders}
         self._joints = tuple(
-            replace(one, joint=present[one.path]) if one.path in present else one for one in self._joints
+            replace(one, **present[one.path]) if one.path in present else one for one in self._joints
         )
         self._assemble()
 

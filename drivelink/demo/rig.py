@@ -117,12 +117,14 @@ def serve(path: Path, seconds: float | None, connection: Connection, change: Cha
 
 
 def _run(path: Path, seconds: float | None, connection: Connection, change: Change | None) -> RunSummary:
-    joint = jointfile.load(path)
+    source = jointfile.load_text(path)
+    joint = source.joint
     world = world_from_joint(joint)
     bus = open_sim_bus(joint.bus)
     network = network_from_joint(joint, bus, world=world)
     try:
-        with Daemon([ServedJoint(joint=joint, path=path)], devices=network.poll) as daemon:
+        served = ServedJoint(joint=joint, path=path, fingerprint=jointfile.fingerprint(source.text))
+        with Daemon([served], devices=network.poll) as daemon:
             signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
             (loop_joint,) = daemon.loop.loop_joints
             tap = TruthTap(loop_joint.sink, world, connection, change)

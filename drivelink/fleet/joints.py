@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import tempfile
 from collections.abc import Iterator
@@ -41,7 +40,7 @@ class Joint:
     @property
     def digest(self) -> str:
         """Names this version of the model."""
-        return hashlib.sha256(self.text.encode()).hexdigest()[:16]
+        return jointfile.fingerprint(self.text)
 
     @contextmanager
     def base_dir(self) -> Iterator[Path]:

@@ -151,13 +151,22 @@ def load_text(path: str | Path) -> JointText:
         JointFileError: as `load`.
     """
     path = Path(path)
+    text = read_text(path)
+    joint = parse(text, str(path))
+    return JointText(joint=joint, text=text, folder=path.absolute().parent, name=str(path), path=path)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a joint file, not yet validated.
+
+    Raises:
+        JointFileError: it cannot be read.
+    """
     try:
-        text = read_regular(path, MAX_BYTES).decode("utf-8-sig").replace("\r\n", "\n")
+        return read_regular(path, MAX_BYTES).decode("utf-8-sig").replace("\r\n", "\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "expected UTF-8 text"
         raise JointFileError(f"{path}: cannot be read as a joint file: {reason}") from error
-    joint = parse(text, str(path))
-    return JointText(joint=joint, text=text, folder=path.absolute().parent, name=str(path), path=path)
 
 
 def parse(text: str, where: str = "joint file") -> JointFile:
@@ -228,7 +237,7 @@ def write_model(
     document = tomlkit.parse(before)
     _merge(document, changes)
     text = f"{_MARK}\n{_apart(tomlkit.dumps(document), before).rstrip()}\n"
-    text += f"# drivelink check: sha256 {_digest(text)}\n"
+    text += f"# drivelink check: sha256 {fingerprint(text)}\n"
     joint = parse(text, str(target))
     with raised_as(JointFileError, f"{target}: cannot be written"):
         write_whole(target, text, force=force)
@@ -250,7 +259,8 @@ def without_check(text: str) -> str:
     return _CHECK.sub("", text).replace(f"{_MARK}\n", "", 1)
 
 
-def _digest(text: str) -> str:
+def fingerprint(text: str) -> str:
+    """Return what says of two joint files whether they are the same."""
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -267,7 +277,7 @@ def _require_whole(text: str, where: str) -> None:
                 f"{where}: truncated: its last line, the check line, is missing (write it again; if you "
                 "removed that line yourself, remove the first one as well)"
             )
-    elif (digest := _digest(text[: checks[-1].start()])) != checks[-1][1]:
+    elif (digest := fingerprint(text[: checks[-1].start()])) != checks[-1][1]:
         _warn_once(where, digest)
 
 

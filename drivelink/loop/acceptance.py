@@ -13,7 +13,16 @@ from typing import Any, NamedTuple
 
 from drivelink.errors import JointFileError, RecordingError, UsageError
 from drivelink.files import read_regular, write_whole
-from drivelink.jointfile import MAX_BYTES, JointFile, JointText, load, load_text, without_check, write_model
+from drivelink.jointfile import (
+    MAX_BYTES,
+    JointFile,
+    JointText,
+    fingerprint,
+    load,
+    load_text,
+    without_check,
+    write_model,
+)
 from drivelink.loop import finding
 from drivelink.loop.finding import folder_of, proposal_file
 from drivelink.plaintext import clean_text
@@ -71,7 +80,7 @@ def proposal(path: Path) -> Proposal:
         elif state != finding.NOTHING:
             said = f"nothing to accept, {state}: {found['sentence']}"
         raise RecordingError(f"{recording.name}: {said}")
-    if found.get("joint_file") != finding.fingerprint(source.text):
+    if found.get("joint_file") != fingerprint(source.text):
         raise RecordingError(
             f"{path}: has changed since {recording.name} was kept: expected the same joint file; "
             f"drivelink keep {path} makes a finding about this one"

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivelink import recording as recordings
 from drivelink.errors import DrivelinkError, RecordingError
-from drivelink.jointfile import JointFile, JointText, apply_diagnosis
+from drivelink.jointfile import JointFile, JointText, apply_diagnosis, fingerprint
 from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from drivelink.loop import finding
 from drivelink.loop.finding import proposal_file
@@ -169,7 +169,7 @@ def make(recording: Path) -> dict[str, Any]:
         "parameters": list(said.parameters),
         "since": None if rose is None else first_s + (rose[0] - int(record.sequence[0])) * record.period_s,
         "error": error._asdict(),
-        "joint_file": finding.fingerprint(source.text),
+        "joint_file": fingerprint(source.text),
         "took_s": round(time.monotonic() - begin_s, 1),
         "report": report.as_json(outcome, runs, recording.name),
     }

@@ -1,6 +1,5 @@
 """A black box's folder: recordings, beside each its finding (a JSON document) and the proposed joint file."""
 
-import hashlib
 import json
 import os
 import re
@@ -133,11 +132,6 @@ NOTHING = "nothing"  # to accept: the model is sufficient, or the motion too poo
 FAILED = "failed"
 ACCEPTED = "accepted"
 UNDONE = "undone"
-
-
-def fingerprint(text: str) -> str:
-    """Return what says of two joint files whether they are the same."""
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def begun(recording: Path, state: str, sentence: str) -> dict[str, Any]:

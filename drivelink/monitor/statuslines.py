@@ -98,6 +98,12 @@ class Shown:
         where = f" (likely at the {self.location})" if self.location else ""
         return f"model alarm{where}: {MODEL_ALARM_ADVICE}" if self.alarm else ""
 
+    @property
+    def look_here(self) -> str:
+        """The advice, and what is wrong, in one line; empty where all is well."""
+        wrong = clean_text("; ".join(self.wrong), 2 * _WORDS)
+        return " · ".join(text for text in (self.advice, wrong) if text)
+
 
 def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> Shown:
     """Extract the shown parts of a status and a model document, whatever they contain."""
@@ -225,11 +231,12 @@ def status_text(
     model: Mapping[str, Any] | None = None,
     finding: Mapping[str, Any] | None = None,
 ) -> str:
-    """Return cycle, residual, advice and finding as text, as far as the documents contain them."""
+    """Return cycle, residual, advice, conditions and finding as text, as far as documents contain them."""
     shown = shape(status, model)
     why = f"not valid: {shown.not_valid}" if shown.not_valid else ""
     found = finding_text(finding or {}, shown)
-    parts = (_cycle(shown), _cpu(shown), _residual(shown), why, shown.advice, found and f"finding: {found}")
+    found = found and f"finding: {found}"
+    parts = (_cycle(shown), _cpu(shown), _residual(shown), why, shown.look_here, found)
     return " · ".join(part for part in parts if part)
 
 

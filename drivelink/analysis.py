@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivelink import jointfile, recording
-from drivelink.errors import HarmfulModelError, RecordingError, UsageError, raised_as
+from drivelink.errors import HarmfulModelError, RecordingError, UsageError, raised_as, require_positive
 from drivelink.files import check_target
 from drivelink.jointfile import apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import as_read, diagnosed_model, floor_entry
@@ -84,6 +84,7 @@ class Fit:
             RecordingError: it cannot be read, or the model cannot be simulated.
         """
         path = Path(other)
+        require_positive("horizon_s", horizon_s)
         for number, motor in enumerate(self.found.model.motors, start=1):
             if motor.flexible and not motor.transmission.parameters:
                 raise RecordingError(
@@ -224,7 +225,11 @@ class Diagnosed:
         return [motions.section(self.motion, self.runs.units)] if asked else []
 
     def report(self, folder: str | Path) -> list[Path]:
-        """Write report.json and report.html into a folder."""
+        """Write report.json and report.html into a folder.
+
+        Raises:
+            OSError: they cannot be written.
+        """
         joint, out = self.runs.source.joint, Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         title = report.Title(joint.name, self.runs.named, self.validated, joint.axis == "linear")
@@ -248,6 +253,7 @@ class Diagnosed:
         Raises:
             RecordingError: nothing is left open, or no motion within the limits moves the joint.
         """
+        require_positive("seconds", seconds)
         model, joint = self.runs.source.joint.model(), self.runs.source.joint
         with raised_as(RecordingError, f"{self.runs.named}: --motion", EstimatorError):
             limits = Limits.declared(self.runs.records, **joint.motion.model_dump())
@@ -259,7 +265,7 @@ class Diagnosed:
 
         Raises:
             UsageError: none was designed.
-            OutputError: a file exists, or cannot be written.
+            OSError: a file exists, or cannot be written.
         """
         if self.motion is None:
             raise UsageError("expected a motion, next_motion() designs one")
@@ -324,6 +330,7 @@ def fit(
     Raises:
         DrivelinkError: a file cannot be read, or the recordings cannot be fitted.
     """
+    require_positive("bandwidth_hz", bandwidth_hz)
     runs = load(recordings, joint, names=names, strict=strict, warn=warn)
     bandwidth = None if bandwidth_hz is None else 2.0 * math.pi * bandwidth_hz
     with raised_as(RecordingError, some(runs.paths), EstimatorError):
@@ -355,6 +362,7 @@ def diagnose(
     Raises:
         DrivelinkError: a file cannot be read, or the recordings cannot be diagnosed.
     """
+    require_positive("bandwidth_hz", bandwidth_hz)
     runs = load(recordings, joint, names=names, strict=strict, warn=warn)
     held, told = None, runs.notes
     if validation is not None:

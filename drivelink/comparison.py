@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from drivelink import analysis, jointfile
-from drivelink.errors import RecordingError, UsageError
+from drivelink.errors import RecordingError, UsageError, require_positive
 from drivelink.output.comparison import Comparison, Side
 from drivelink.output.numbers import Units
 from estimator.errors import EstimatorError
@@ -30,6 +30,7 @@ def compare(
     Raises:
         DrivelinkError: a file cannot be read or fitted, or the joints have different numbers of motors.
     """
+    require_positive("horizon_s", horizon_s)
     paths = [Path(a), Path(b)]
     models = [path for path in paths if path.suffix.lower() == ".toml"]
     own = joint if joint is not None else next(iter(models), None)

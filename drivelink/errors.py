@@ -1,7 +1,9 @@
 """The service's exceptions. Each is one line for the user: what, where, what was expected."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from numbers import Real
 
 from drivelink.plaintext import clean_text
 
@@ -33,6 +35,30 @@ class UsageError(DrivelinkError):
     """The command line is wrong."""
 
     exit_status = 2
+
+
+class ArgumentError(UsageError, ValueError):
+    """An argument of a Python call is wrong."""
+
+
+def require(argument: str, value: object, good: bool, expected: str) -> None:
+    """Refuse the value of an argument.
+
+    Raises:
+        ArgumentError: it is not good.
+    """
+    if not good:
+        raise ArgumentError(f"{argument}: expected {expected}, got {value!r}")
+
+
+def require_positive(argument: str, value: object) -> None:
+    """Refuse what is neither None nor a finite number above zero.
+
+    Raises:
+        ArgumentError: it is neither.
+    """
+    good = value is None or (isinstance(value, Real) and 0.0 < float(value) < math.inf)
+    require(argument, value, good, "a number above 0")
 
 
 class JointFileError(DrivelinkError):

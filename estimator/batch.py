@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimator.choices import choice, least_rows, log_odds
-from estimator.diagnosis.bandwidth import choose_bandwidth, widest
+from estimator.diagnosis.bandwidth import choose_bandwidth, require_bandwidth
 from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.findings import DELAYS, stamped_wrongly
 from estimator.diagnosis.frame import Frame
@@ -184,9 +184,7 @@ def fit_joint(
         bandwidth_hz = choose_bandwidth(usable, model)
     else:
         bandwidth_hz = bandwidth_rad_s / (2.0 * math.pi)
-    most = widest(max(one.period_s for one in usable))
-    if not 0.0 < bandwidth_hz <= most:
-        raise EstimatorError(f"bandwidth: expected more than 0 and at most {most:g} Hz, got {bandwidth_hz:g}")
+    require_bandwidth(bandwidth_hz, usable)
 
     def made(model: JointModel, like: Problem | None) -> Problem:
         return _joint_problem(usable, model, bandwidth_hz, like)

@@ -1,6 +1,7 @@
 """The client: values, waiting, gaps, age, sources, and the daemon's comings and goings as states."""
 
 import asyncio
+import inspect
 import math
 import threading
 import time
@@ -236,10 +237,49 @@ def test_no_thread_and_no_session_is_left_behind_but_one_that_was_lent(endpoint,
         close_session(session)
 
 
-@pytest.mark.parametrize("name", ["", "*", "a b", "elbow?x", "el/**"])
-def test_a_name_that_cannot_be_a_joint_is_one_line(name):
-    with pytest.raises(ZenohError, match="joint: expected a name"):
-        drivelink.subscribe(name)
+@pytest.mark.parametrize(
+    ("argument", "value", "expected"),
+    [
+        *(("joint", name, "a name") for name in ("", "*", "a b", "elbow?x", "el/**", None, 5)),
+        ("prefix", "", "a name"),
+        ("endpoint", 7447, "text like"),
+        ("config", "", "the path of"),
+        ("session", "elbow", "an open zenoh session"),
+        *(("depth", depth, "a whole number from 1 to") for depth in (0, -3, 1.5, "8", 10**9)),
+        *(("stale_after_s", age_s, "seconds above 0") for age_s in (-1, 0, math.nan, "1")),
+    ],
+)
+def test_an_argument_that_cannot_be_is_one_line(argument, value, expected):
+    for make in (drivelink.subscribe, drivelink.subscribe_async):
+        with pytest.raises(ValueError, match=f"^{argument}: expected {expected}.*, got ") as caught:
+            make(**({"joint": "elbow"} | {argument: value}))
+        assert "\n" not in str(caught.value)
+    if argument in inspect.signature(drivelink.joints).parameters:
+        with pytest.raises(ValueError, match=f"^{argument}: expected {expected}"):
+            drivelink.joints(**{argument: value})
+
+
+@pytest.mark.parametrize("endpoint", ["", "elbow", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "tcp/:7447x"])
+def test_an_endpoint_at_which_nobody_can_listen_is_one_line(endpoint):
+    """Without a port a subscriber waited forever."""
+    with pytest.raises(ZenohError, match=r'^endpoint: expected a zenoh endpoint like "tcp/.*", got "'):
+        drivelink.joints(endpoint=endpoint)
+
+
+@pytest.mark.parametrize("timeout_s", [math.nan, "1"])
+def test_a_time_to_wait_that_is_none_is_one_line(endpoint, timeout_s):
+    """NaN waited forever."""
+
+    async def controller():
+        async with drivelink.subscribe_async("elbow", endpoint=endpoint) as joint:
+            assert await joint.wait(-1.0) is None
+            await joint.wait(timeout_s)
+
+    with drivelink.subscribe("elbow", endpoint=endpoint, stale_after_s=math.inf) as joint:
+        assert joint.wait(-1.0) is None and next(joint.cycles(-1.0)) is None  # a deadline that is over
+        for wait in (lambda: joint.wait(timeout_s), lambda: asyncio.run(controller())):
+            with pytest.raises(ValueError, match=r"^timeout_s: expected seconds, or None"):
+                wait()
 
 
 def test_asyncio_waits_iterates_and_times_out(publisher, endpoint):

@@ -77,6 +77,7 @@ def test_columns_of_others_are_read_in_our_names_and_units_also_in_place_of_ours
     assert np.array_equal(record.link_position_rad, same.motor_position_rad[:, 0])
     assert UNITS["_rad_s"]["rpm"] * 60 == UNITS["_rad"]["rev"] == 360 * UNITS["_rad"]["deg"] == 2 * math.pi
     assert parse_column_map(["a=b=time_s:us"])["time_s"] == ("a=b", 1e-6, True, "us")
+    assert parse_column_map("a=time_s") == parse_column_map(["a=time_s"])  # a text, not its letters
 
 
 def test_a_format_with_columns_is_one_entry(tmp_path, monkeypatch):

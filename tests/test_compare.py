@@ -2,9 +2,10 @@
 
 import io
 import json
+import math
 import re
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import joints
@@ -186,6 +187,17 @@ def test_three_lines_fit_predict_plot_and_write(fleet, tmp_path):
     assert repr(found) == str(found) and str(found).startswith("The model is sufficient")
     assert found.plot()._repr_png_().startswith(b"\x89PNG")
     assert [path.name for path in found.report(tmp_path)] == ["report.json", "report.html"]
+
+
+@pytest.mark.parametrize("value", [-1, 0, math.nan, math.inf, "8"])
+def test_a_number_of_the_python_interface_that_cannot_be_is_one_line(value):
+    for call, argument in (
+        (drivelink.fit, {"bandwidth_hz": value}),
+        (drivelink.diagnose, {"bandwidth_hz": value}),
+        (partial(drivelink.compare, "a.toml"), {"horizon_s": value}),
+    ):
+        with pytest.raises(ValueError, match=f"^{next(iter(argument))}: expected a number above 0, got "):
+            call("nosuch.csv", **argument)
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_a_healthy_bus_is_found_healthy_and_nothing_is_written(rig):
         '[motor.drive] second_encoder = "0x60E4:01"': "second encoder (0x60E4:01)",
     }.items():
         assert offered[fix].startswith(begin)
-    out = Console(record=True, width=120)
+    out = Console(record=True, width=120, force_terminal=True)
     report.show(out)
     shown = out.export_text()
     assert shown.count("can be compared with torque") == shown.count("sync_counter_overflow") == 1
@@ -252,7 +252,7 @@ def test_of_a_sheet_every_link_encoder_is_named_and_only_what_run_uses_is_mapped
     assert any(line.startswith("nano.eds: NANO 7, vendor 0x26C, ") for line in said)  # the maker only once
     mapped = [entry for frame in report.sections[0].facts["mapping"] for entry in frame["objects"]]
     assert mapped and not any(entry.startswith("0x606C") for entry in mapped)
-    out = Console(record=True, width=120)
+    out = Console(record=True, width=120, force_terminal=True)
     report.show(out)
     assert "this device gives what is needed" in out.export_text()
 
@@ -352,6 +352,17 @@ def test_words_of_a_drive_do_not_reach_the_terminal_as_commands(capsys):
     shown = capsys.readouterr().out + str(report.as_dict())
     assert "]0;owned2J[red]servo" in shown
     assert not set("\x1b\x07\x9b\u202e") & set(shown)
+
+
+def test_in_a_pipe_nothing_is_folded_or_padded(capsys):
+    report = Report()
+    section = report.section("Machine")
+    section.warn("timer", "late " * 40, "another kernel")
+    section.ok("kernel", "Linux")
+    report.show(Console())
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line != line.rstrip()] == [] and len(lines) == 6, lines
+    assert lines[1].count("late") == 40 and lines[2].strip() == "fix: another kernel"
 
 
 class Babbler(Slave):

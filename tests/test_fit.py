@@ -120,6 +120,7 @@ def test_what_cannot_be_fitted_is_reported(elbow):
         (still, (model,), "stands still"),
         (joints.part(record, slice(100)), (model,), "at least"),
         (joints.part(record, slice(1500)), (model, 2.0 * np.pi * 4.0), short),
+        (record, (model, 1e-8), r"bandwidth: expected .* to .* Hz, got 1\.59"),  # of years
         (record, (joints.joint_model(1.0, 1.0, m=2),), "1 motor: expected 2"),
     ):
         with pytest.raises(EstimatorError, match=message):

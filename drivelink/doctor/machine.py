@@ -55,8 +55,8 @@ def _rights(section: Section, capabilities: int) -> None:
         ("memory", locked, _NEEDED_LOCKED, _CAP_IPC_LOCK, "can be locked",
          f"only {locked >> 10} KiB may be locked: a page fault may delay a cycle", "memlock unlimited"),
         ("files", files, FILES, None,
-         f"{FILES} may be open: connections that say nothing lock no subscriber out",
-         f"only {files} may be open, {FILES} are wanted: as many connections lock new subscribers out",
+         f"{FILES} may be open: idle connections cannot lock subscribers out",
+         f"only {files} may be open, {FILES} are wanted: as many idle connections lock new subscribers out",
          f"nofile {FILES}"),
     ):  # fmt: skip
         has = instead is not None and capabilities >> instead & 1

@@ -14,6 +14,7 @@ from rich.text import Text
 from drivelink.notice import Findings, Notice, Severity
 from drivelink.plaintext import spelt
 
+_UNFOLDED = 10_000  # columns
 _MARKS = {
     Severity.OK: ("✓", "green"),
     Severity.INFO: ("·", "cyan"),
@@ -62,6 +63,16 @@ class Report:
         }
 
     def show(self, console: Console) -> None:
+        """Print it, unfolded and without padding where nobody sees columns."""
+        if console.is_terminal:
+            self._show(console)
+            return
+        with console.capture() as printed:
+            console.width = _UNFOLDED
+            self._show(console)
+        console.file.write("".join(f"{line.rstrip()}\n" for line in printed.get().splitlines()))
+
+    def _show(self, console: Console) -> None:
         """Print it; what may be done with several nodes alike stands at the first one."""
         said: dict[Notice, str] = {}  # and where
         for section in self.sections:

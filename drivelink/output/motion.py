@@ -24,7 +24,7 @@ def write(motion: NextMotion, path: Path, units: Units, *, force: bool = False) 
     """Write the CSV file, and its picture beside it.
 
     Raises:
-        OutputError: a file exists, or cannot be written.
+        OSError: a file exists, or cannot be written.
     """
     names, columns = ["time_s"], [motion.time_s]
     for i in range(motion.position_rad.shape[1]):

@@ -25,7 +25,7 @@ from typing import Any, Self
 
 import zenoh
 
-from drivelink.pubsub.clientbase import PATIENCE_S, Client
+from drivelink.pubsub.clientbase import PATIENCE_S, Client, require_timeout
 from drivelink.pubsub.feed import WAKE
 from drivelink.pubsub.wire import EstimateMessage
 
@@ -39,18 +39,19 @@ class Subscription(Client):
         config: a zenoh configuration file (JSON5) instead of the endpoint: TLS, access control, scouting.
         prefix: first part of every key, as in the joint file.
         session: an open session to use instead; it stays open.
-        depth: estimates kept unread before the oldest is dropped.
+        depth: estimates kept unread before the oldest is dropped, up to a million.
         stale_after_s: age from which an estimate is stale; None: five periods, at least 20 ms.
 
     Raises:
-        ZenohError: no session can be opened, or a name cannot be part of a key.
+        ZenohError: no session can be opened.
+        ArgumentError: an argument is wrong: a name that cannot be part of a key, a time below zero.
     """
 
     def wait(self, timeout_s: float | None = None) -> EstimateMessage | None:
         """Return the newest unread estimate; wait for one if there is none.
 
         Args:
-            timeout_s: longest wait; None: forever.
+            timeout_s: longest wait; None: forever; 0 or less: none.
 
         Returns:
             The estimate, or None after a timeout or when closed.
@@ -104,6 +105,7 @@ class Subscription(Client):
     def _wait(
         self, timeout_s: float | None, pick: Callable[[], EstimateMessage | None]
     ) -> EstimateMessage | None:
+        require_timeout(timeout_s)
         deadline_s = math.inf if timeout_s is None else time.monotonic() + timeout_s
         self._drain()
         while (message := pick()) is None:
@@ -173,7 +175,8 @@ class AsyncSubscription(Client):
     """Subscribe as `Subscription` does, for asyncio: made in a running loop.
 
     Raises:
-        ZenohError: no session can be opened, or a name cannot be part of a key.
+        ZenohError: no session can be opened.
+        ArgumentError: an argument is wrong, as for `Subscription`.
     """
 
     async def wait(self, timeout_s: float | None = None) -> EstimateMessage | None:
@@ -224,6 +227,7 @@ class AsyncSubscription(Client):
     async def _wait(
         self, timeout_s: float | None, pick: Callable[[], EstimateMessage | None]
     ) -> EstimateMessage | None:
+        require_timeout(timeout_s)
         self._drain()
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from drivelink.errors import ZenohError
+from drivelink.errors import ZenohError, require
 from drivelink.plaintext import clean_text, natural
 from drivelink.pubsub.feed import DECODERS, DOCUMENTS, WAKE, Feed, State, follow_document, source_of
 from drivelink.pubsub.session import ENDPOINT, close_session, connected, one_line, open_client
@@ -42,7 +43,9 @@ def joints(
 
     Raises:
         ZenohError: no session can be opened.
+        ArgumentError: an argument is wrong.
     """
+    _require_place(endpoint, config, prefix)
     session = open_client(endpoint, config)
     try:
         if not connected(session):
@@ -86,7 +89,30 @@ def _enter(names: set[str], reply: zenoh.Reply, prefix: str) -> None:
 
 _LOG = logging.getLogger("drivelink.client")
 _TOGETHER = 5  # largest distance in cycles between estimate and external torque, as either may be lost
+_MOST_UNREAD = 1 << 20  # zenoh reserves a queue's memory at once, 256 MB for so many
 _NAME = re.compile(r"[^*$#?\s/]+(/[^*$#?\s/]+)*")
+
+
+def _require_name(argument: str, value: object) -> None:
+    good = isinstance(value, str) and _NAME.fullmatch(value) is not None
+    require(argument, value, good, "a name without wildcards or spaces")
+
+
+def _require_place(endpoint: object, config: object, prefix: object) -> None:
+    _require_name("prefix", prefix)
+    require("endpoint", endpoint, isinstance(endpoint, str), f"text like {ENDPOINT!r}")
+    good = config is None or (isinstance(config, str | Path) and str(config) not in ("", "."))
+    require("config", config, good, "the path of a zenoh configuration file")
+
+
+def require_timeout(timeout_s: object) -> None:
+    """Refuse what is no time to wait; one that is over is none to wait.
+
+    Raises:
+        ArgumentError: it is neither None nor a number.
+    """
+    good = timeout_s is None or (isinstance(timeout_s, Real) and timeout_s == timeout_s)
+    require("timeout_s", timeout_s, good, "seconds, or None to wait forever")
 
 
 class Client:
@@ -103,11 +129,14 @@ class Client:
         depth: int = 1024,
         stale_after_s: float | None = None,
     ) -> None:
-        for what, text in (("joint", joint), ("prefix", prefix)):
-            if not _NAME.fullmatch(text):
-                raise ZenohError(f'{what}: expected a name without wildcards or spaces, got "{text}"')
-        if depth < 1:
-            raise ZenohError(f"depth: expected at least 1, got {depth}")
+        _require_name("joint", joint)
+        _require_place(endpoint, config, prefix)
+        good = session is None or (isinstance(session, zenoh.Session) and not session.is_closed())
+        require("session", session, good, "an open zenoh session")
+        good = isinstance(depth, Integral) and 1 <= depth <= _MOST_UNREAD
+        require("depth", depth, good, f"a whole number from 1 to {_MOST_UNREAD}")
+        good = stale_after_s is None or (isinstance(stale_after_s, Real) and stale_after_s > 0.0)
+        require("stale_after_s", stale_after_s, good, "seconds above 0")
         self.joint = joint
         self.key = f"{prefix}/{joint}"
         self._depth = depth

@@ -282,7 +282,7 @@ class Feed:
         self.arrivals = Arrivals(now_ns)
         self.identity = DaemonIdentity()  # whose messages are taken
         self._depth = depth
-        self._stale_after_ns = None if stale_after_s is None else int(stale_after_s * 1e9)
+        self._stale_after_ns = None if stale_after_s is None else stale_after_s * 1e9
         self._period_ns = 0
         self._source: str | None = None  # session that wrote the latest estimate
 

@@ -148,7 +148,8 @@ _MEETING_S = 2.0  # timeout of a local handshake, reached only if another progra
 _POLL_S = 0.01
 _SCOUTING_MS = 250  # for a session to hear of another one
 ENDPOINT = "tcp/127.0.0.1:7447"
-_LINKS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream", "serial", "vsock")
+_WITH_PORT = ("tcp", "tls", "udp", "quic", "ws")
+_LINKS = (*_WITH_PORT, "unixsock-stream", "serial", "vsock")
 _MOST_CONFIG_BYTES = 256 << 10
 FILES = 8192  # open files: more than the connections that may wait
 _LEAST_FILES = 64  # of which a daemon takes two dozen; a child process and subscribers need more
@@ -281,7 +282,8 @@ def one_line(error: BaseException) -> str:
 
 def _require_endpoint(endpoint: str) -> str:
     link, _, address = endpoint.partition("/")
-    if link not in _LINKS or not address:
+    port = re.fullmatch(r".+:(\d{1,5})(?:[#?].*)?", address)
+    if link not in _LINKS or not address or (link in _WITH_PORT and not (port and int(port[1]) < 1 << 16)):
         raise ZenohError(f'endpoint: expected a zenoh endpoint like "{ENDPOINT}", got "{endpoint}"')
     return endpoint
 

@@ -54,7 +54,7 @@ def parse_column_map(texts: Sequence[str]) -> ColumnMap:
         UsageError: another form.
     """
     found: dict[str, Source] = {}
-    for text in texts:
+    for text in (texts,) if isinstance(texts, str) else texts:
         source, equals, target = text.rpartition("=")
         name, _, unit = target.partition(":")
         if not equals or not source.strip() or name not in COLUMNS:

@@ -11,10 +11,11 @@ from scipy.optimize import brentq
 from estimator.choices import choice, rate
 from estimator.diagnosis.frame import Signals
 from estimator.diagnosis.spectral import lowpass
+from estimator.errors import EstimatorError
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
-__all__ = ["choose_bandwidth", "torque_rms", "widest"]
+__all__ = ["choose_bandwidth", "require_bandwidth", "torque_rms", "widest"]
 
 
 def torque_rms(record: Record) -> float:
@@ -23,9 +24,9 @@ def torque_rms(record: Record) -> float:
 
 
 def choose_bandwidth(records: Sequence[Record], model: JointModel) -> float:
-    """Return a bandwidth from the data, Hz: that of the recording that needs the narrowest,
-    but wide enough for
-    `fit_periods` of it in the shortest.
+    """Return a bandwidth from the data, Hz: that of the recording that needs the narrowest.
+
+    It is wide enough for `fit_periods` of it in the shortest recording.
     """
     shortest_s = min(len(one) * one.period_s for one in records)
     least = min(choice("fit_periods") / shortest_s, widest(max(one.period_s for one in records)))
@@ -59,6 +60,18 @@ def _suits(record: Record, model: JointModel) -> float:
 def widest(period_s: float) -> float:
     """Return the largest bandwidth, Hz: every sample is a row."""
     return 1.0 / (rate() * period_s)
+
+
+def require_bandwidth(bandwidth_hz: float, records: Sequence[Record]) -> None:
+    """Refuse a bandwidth of which no period fits into the longest recording, or beyond `widest`.
+
+    Raises:
+        EstimatorError: it is out of this range.
+    """
+    least = 1.0 / max(len(one) * one.period_s for one in records)
+    most = widest(max(one.period_s for one in records))
+    if not least <= bandwidth_hz <= most:
+        raise EstimatorError(f"bandwidth: expected {least:.3g} to {most:g} Hz, got {bandwidth_hz:g}")
 
 
 def rough_stiffness(record: Record, model: JointModel) -> list[float]:

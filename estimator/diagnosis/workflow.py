@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from estimator.choices import least_rows
-from estimator.diagnosis.bandwidth import choose_bandwidth, widest
+from estimator.diagnosis.bandwidth import choose_bandwidth, require_bandwidth
 from estimator.diagnosis.heldout import Held, held_out
 from estimator.diagnosis.misdeclared import asks
 from estimator.diagnosis.order import bends, ordered_beside, sharp
@@ -15,7 +15,6 @@ from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.verdict import Judge
 from estimator.effects import sharpened
-from estimator.errors import EstimatorError
 from estimator.gate import check, without_hold
 from estimator.model import JointModel
 from estimator.sample import Record
@@ -53,10 +52,8 @@ def diagnose(
         check(one, model)
     model = without_hold(everything, model)
     progress("bandwidth")
-    bandwidth = bandwidth_hz or choose_bandwidth(records, model)
-    most = widest(max(r.period_s for r in records))
-    if not 0.0 < bandwidth <= most:
-        raise EstimatorError(f"bandwidth: expected more than 0 and at most {most:g} Hz, got {bandwidth:g}")
+    bandwidth = choose_bandwidth(records, model) if bandwidth_hz is None else bandwidth_hz
+    require_bandwidth(bandwidth, records)
 
     def made(model: JointModel, like: Problem | None = None) -> Problem:
         return Problem(records, model, bandwidth, least=least_rows(), like=like)

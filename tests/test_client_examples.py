@@ -108,6 +108,16 @@ def test_the_rust_example_reads_the_golden_vectors_and_the_daemon(daemon):
     with waiting:
         assert "no estimate of nosuch" in waiting.stderr.readline()  # not silence
         waiting.kill()
+    for wrong, said in (
+        (["elbow", "tcp/127.0.0.1:1"], "tcp/127.0.0.1:1: nobody answers there: expected a daemon"),
+        (["elbow", "7447"], "ENDPOINT: expected one like tcp/127.0.0.1:7447, got 7447"),
+        (["el bow#", daemon], 'JOINT: expected the name of a joint, got "el bow#"'),
+        (["elbow", daemon, "all"], "COUNT: expected a whole number, got all"),
+    ):
+        done = subprocess.run(
+            [target / "debug" / "drivelink-subscribe", *wrong], capture_output=True, text=True, timeout=60
+        )
+        assert done.returncode == 1 and done.stderr.startswith(said) and done.stderr.count("\n") == 1
 
 
 @pytest.fixture(scope="module")

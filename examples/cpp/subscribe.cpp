@@ -35,7 +35,7 @@ bool show(const z_loaned_sample_t *sample, uint64_t *last, uint64_t *missing) {
 int run(const z_loaned_session_t *session, const std::string &key, long count) {
     z_view_keyexpr_t expression;
     if (z_view_keyexpr_from_str(&expression, key.c_str()) < 0) {
-        std::fprintf(stderr, "%s: not a key\n", key.c_str());
+        std::fprintf(stderr, "%s: not a key: expected the name of a joint\n", key.c_str());
         return 1;
     }
     z_owned_closure_sample_t closure;
@@ -64,13 +64,17 @@ int main(int argc, char **argv) {
     const std::string joint = argc > 1 ? argv[1] : "elbow";
     const std::string endpoint = argc > 2 ? argv[2] : "tcp/127.0.0.1:7447";
     const long count = argc > 3 ? std::strtol(argv[3], nullptr, 10) : 1000000000L;
+    if (count <= 0) {
+        std::fprintf(stderr, "COUNT: expected a whole number above 0, got %s\n", argv[3]);
+        return 1;
+    }
     z_owned_config_t config;
     z_config_default(&config);
     zp_config_insert(z_loan_mut(config), Z_CONFIG_MODE_KEY, "client");
     zp_config_insert(z_loan_mut(config), Z_CONFIG_CONNECT_KEY, endpoint.c_str());
     z_owned_session_t session;
     if (z_open(&session, z_move(config), nullptr) < 0) {
-        std::fprintf(stderr, "%s: nobody answers there\n", endpoint.c_str());
+        std::fprintf(stderr, "%s: nobody answers there: expected a daemon (drivelink run) or a zenoh router\n", endpoint.c_str());
         return 1;
     }
     if (zp_start_read_task(z_loan_mut(session), nullptr) < 0 || zp_start_lease_task(z_loan_mut(session), nullptr) < 0) {

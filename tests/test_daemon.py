@@ -299,6 +299,10 @@ def test_whether_a_joint_file_is_in_use_is_told_by_its_text(reloadable, tmp_path
     path.touch()
     taken(reloader)
     assert reloader._thread is None and reloadable.status["conditions"] == []
+    for content in ("name", text):
+        path.write_text(content, encoding="utf-8")
+        taken(reloader)
+    assert reloadable.events[-1] == "elbow.toml: as it is in use again"
 
 
 def test_a_joint_file_that_is_gone_or_none_leaves_the_model_as_it_is(reloadable, tmp_path, monkeypatch):

@@ -76,7 +76,7 @@ def test_an_injected_effect_is_named_located_and_measured(case, records):
     at_noise = found.validation.after_relative < choice("floor")
     assert found.validation.after_rms_nm <= found.validation.before_rms_nm or at_noise
     assert first.probability > 0.9
-    assert any("error after over before: " in note for note in found.notes)
+    assert any(" is left in the motor's balance, " in note for note in found.notes)
 
 
 def test_friction_that_peaks_at_standstill_is_named_on_a_motion_that_rarely_stands_still(records):

@@ -101,7 +101,7 @@ def test_the_report_is_self_contained_and_has_the_verdict_units_bands_the_winner
         ">refitted</text>", "Stiffness of motor 1's transmission, with 95 % bands", "prefers-color-scheme: dark", "currentColor",
     ):  # fmt: skip
         assert part in page, part
-    assert page.index("<h2>Notes") < page.index("error after over before")
+    assert page.index("<h2>Notes") < page.index("of the error ")
     for foreign in ("#ffffff", 'src="http', 'href="http', "@import", "<script"):
         assert foreign not in page
     # The one that was chosen, and what the mark means.

@@ -217,7 +217,8 @@ class _Summary:
 
     def text(self) -> str:
         counts = [f"{n} {_PLURAL[kind]}" for kind, n in self._recorder.sink.counts.items() if n]
-        lost = "".join(f", {n} cycles without {kind}" for kind, n in self._missed().items() if n)
+        missed = [(n, "s" * (n > 1), kind) for kind, n in self._missed().items() if n]
+        lost = "".join(f", {n} cycle{s} without {kind}" for n, s, kind in missed)
         taps = [tap for tap in self._recorder.taps if isinstance(tap, ZenohTap)]
         silent_s, refused = sum(tap.silent_s for tap in taps), sum(tap.refused for tap in taps)
         lost += f", nothing from the daemon for {silent_s:.0f} s" if silent_s else ""

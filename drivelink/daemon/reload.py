@@ -128,7 +128,7 @@ class Reloader:
         try:
             self._text = fingerprint(read_text(self.path))
             if self._text == self._known and not asked:
-                self._stand(self._restart)
+                self._stand(self._restart, over=f"{self.path.name}: as it is in use again")
                 self._next_s, self._thread = -math.inf, None
                 return
             self._stand(f"{self.path.name}: edited, not in use yet", logging.DEBUG)
@@ -141,10 +141,10 @@ class Reloader:
             return
         self._follow(joint, built)
 
-    def _stand(self, text: str, level: int = logging.WARNING) -> None:
+    def _stand(self, text: str, level: int = logging.WARNING, over: str = "") -> None:
         """Report what holds of the file until something else does; empty: it is in use."""
         if text != self._standing:
-            self._events.end(self._standing)
+            self._events.end(self._standing, over)
             self._standing = text
             if text:
                 self._events.begin(text, text, level)

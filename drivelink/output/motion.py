@@ -73,12 +73,7 @@ def section(motion: NextMotion | None, units: Units) -> Section:
         odds = float(np.exp(np.clip(one["least_log_odds"], 0.0, np.log(_MOST))))
         against = f"{'> ' if odds > 0.99 * _MOST else ''}{number(odds, 2)} : 1"
         rows.append((in_words(one["effects"]), f"{one['probability']:.2f}", f"{one['told']:.2f}", against))
-    head = (
-        "if this is what is missing",
-        "probability now",
-        "told after the motion",
-        "odds over the next best",
-    )
+    head = ("effect", "probability now", "after the motion", "odds to the next")
     caption = "Motion of the motors, and the torque that the likeliest needs."
     chart = Chart(lambda: figure(motion, units, _ON_PAGE), caption)
     return Section("What to move next", [Paragraph(said), Grid(head, rows), chart])

@@ -246,7 +246,7 @@ class Judge:
         return []
 
     def _sides(self, before: Fitted, after: Fitted) -> list[str]:
-        """Residuals of both balances, after over before, in words."""
+        """What the effects leave of the residuals of both balances, in words."""
         problem = self.problem
         if not problem.frames[0].linked:
             return []
@@ -255,7 +255,7 @@ class Judge:
         residuals = [h.regression.residual(h.posterior.x) for h in (before, after)]
         left = np.array([[np.sqrt(np.mean(r[side] ** 2)) for side in sides] for r in residuals])
         motor, link = (percent(float(x), 1) for x in left[1] / np.maximum(left[0], 1e-300))
-        said = f"error after over before: {motor} in the motor's balance, {link} in the link's"
+        said = f"of the error {motor} is left in the motor's balance, {link} in the link's"
         return [f"{said} (an effect at one side lowers only that side's)"]
 
     def _left(self, found: Fitted) -> float:

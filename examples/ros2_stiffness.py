@@ -42,8 +42,11 @@ class Stiffness:
 
 
 def main(joint: str = "elbow", topic: str = "/dynamic_joint_states") -> None:
-    import rclpy
-    from control_msgs.msg import DynamicJointState
+    try:
+        import rclpy
+        from control_msgs.msg import DynamicJointState
+    except ImportError as error:
+        sys.exit(f"{error}: expected ROS 2, source /opt/ros/DISTRO/setup.sh, with control_msgs")
 
     rclpy.init()
     node = rclpy.create_node("stiffness_reader")
@@ -61,4 +64,6 @@ def main(joint: str = "elbow", topic: str = "/dynamic_joint_states") -> None:
 
 
 if __name__ == "__main__":
+    if {"-h", "--help"} & set(sys.argv):
+        sys.exit(print(__doc__))
     main(*sys.argv[1:])

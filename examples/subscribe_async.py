@@ -8,6 +8,7 @@ import signal
 import sys
 
 import drivelink
+from drivelink.errors import DrivelinkError
 
 
 async def follow(joint: str, endpoint: str) -> None:
@@ -22,14 +23,21 @@ async def follow(joint: str, endpoint: str) -> None:
 
 async def main(joints: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: str = "10") -> None:
     tasks = [asyncio.create_task(follow(joint, endpoint)) for joint in joints.split(",")]
-    _, running = await asyncio.wait(tasks, timeout=float(seconds))
+    ended, running = await asyncio.wait(tasks, timeout=float(seconds), return_when=asyncio.FIRST_EXCEPTION)
     for task in running:
         task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
+    await asyncio.gather(*running, return_exceptions=True)
+    for task in ended:
+        task.result()  # raises what ended it
 
 
 if __name__ == "__main__":
+    if {"-h", "--help"} & set(sys.argv):
+        sys.exit(print(__doc__))
     sys.stdout.reconfigure(line_buffering=True)  # a pipe or a file has every line, however it ends
     for ending in (signal.SIGINT, signal.SIGPIPE):  # Ctrl-C and `| head` end it without a traceback
         signal.signal(ending, signal.SIG_DFL)
-    asyncio.run(main(*sys.argv[1:]))
+    try:
+        asyncio.run(main(*sys.argv[1:]))
+    except (DrivelinkError, ValueError) as error:
+        sys.exit(f"{error}\n{__doc__}")

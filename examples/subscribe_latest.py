@@ -8,6 +8,7 @@ import sys
 import time
 
 import drivelink
+from drivelink.errors import DrivelinkError
 
 PERIOD_S = 0.01
 FALLBACK_NM_RAD = 500.0  # what the controller assumes where it must not trust the estimate
@@ -30,7 +31,12 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
 
 
 if __name__ == "__main__":
+    if {"-h", "--help"} & set(sys.argv):
+        sys.exit(print(__doc__))
     sys.stdout.reconfigure(line_buffering=True)  # a pipe or a file has every line, however it ends
     for ending in (signal.SIGINT, signal.SIGPIPE):  # Ctrl-C and `| head` end it without a traceback
         signal.signal(ending, signal.SIG_DFL)
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except (DrivelinkError, ValueError) as error:
+        sys.exit(f"{error}\n{__doc__}")

@@ -10,6 +10,7 @@ import time
 import numpy as np
 
 import drivelink
+from drivelink.errors import DrivelinkError
 
 
 def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: str = "1") -> None:
@@ -27,5 +28,10 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
 
 
 if __name__ == "__main__":
+    if {"-h", "--help"} & set(sys.argv):
+        sys.exit(print(__doc__))
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except (DrivelinkError, ValueError) as error:
+        sys.exit(f"{error}\n{__doc__}")

@@ -8,6 +8,7 @@ import sys
 import time
 
 import drivelink
+from drivelink.errors import DrivelinkError
 
 TIMEOUT_S = 0.01  # ten cycles at 1 kHz
 
@@ -37,7 +38,12 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
 
 
 if __name__ == "__main__":
+    if {"-h", "--help"} & set(sys.argv):
+        sys.exit(print(__doc__))
     sys.stdout.reconfigure(line_buffering=True)  # a pipe or a file has every line, however it ends
     for ending in (signal.SIGINT, signal.SIGPIPE):  # Ctrl-C and `| head` end it without a traceback
         signal.signal(ending, signal.SIG_DFL)
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except (DrivelinkError, ValueError) as error:
+        sys.exit(f"{error}\n{__doc__}")

@@ -7,6 +7,7 @@ import runpy
 import shutil
 import signal
 import subprocess
+import sys
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,6 +75,20 @@ def test_python_examples_end_without_a_traceback_by_ctrl_c_and_where_nobody_read
         alone.send_signal(signal.SIGINT)
         for process, _ in (*running, (alone, False)):
             assert "Traceback" not in process.communicate(timeout=20)[1]
+
+
+@pytest.mark.parametrize("name", ["latest", "wait", "numpy", "async"])
+def test_the_examples_explain_themselves_and_a_wrong_argument(name):
+    path = EXAMPLES / f"subscribe_{name}.py"
+    assert f"{path.name} [JOINT" in run(sys.executable, path, "--help")
+    for wrong, said in ((("el bow",), "joint: expected a name"), (("elbow", "7447"), "endpoint: expected")):
+        done = subprocess.run([sys.executable, path, *wrong], capture_output=True, text=True, timeout=60)
+        assert done.returncode == 1 and done.stderr.startswith(said) and f"{path.name} [" in done.stderr
+
+
+def test_without_ros_its_example_says_what_it_needs():
+    done = subprocess.run([sys.executable, EXAMPLES / "ros2_stiffness.py"], capture_output=True, text=True)
+    assert done.returncode == 1 and "expected ROS 2" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_a_controller_in_its_safe_state_says_why(monkeypatch, capsys):

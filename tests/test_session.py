@@ -1,6 +1,7 @@
 """Zenoh sessions between real processes: sharing one endpoint, losing one, safe defaults, clean ends."""
 
 import json
+import re
 import resource
 import socket
 import subprocess
@@ -153,7 +154,9 @@ def test_another_program_on_the_endpoint_is_one_line(endpoint, monkeypatch):
     assert f"{endpoint}: another program listens there" in str(error.value)
 
 
-@pytest.mark.parametrize("endpoint", ["nonsense", "tcp", "carrier-pigeon/roof"])
+@pytest.mark.parametrize(
+    "endpoint", ["nonsense", "tcp", "carrier-pigeon/roof", "tcp/127.0.0.1", "tcp/127.0.0.1:99999"]
+)
 def test_an_endpoint_that_is_none_is_one_line(endpoint):
     with pytest.raises(ZenohError) as error:
         close_session(open_session(ZenohSection(endpoint=endpoint), Path()))
@@ -192,6 +195,13 @@ def test_a_configuration_that_cannot_be_used_is_one_line_with_its_file(tmp_path,
     assert str(tmp_path / "mine.json5") in str(error.value)
     assert "\n" not in str(error.value)
     assert ".rs:" not in str(error.value)
+
+
+def test_where_nobody_answers_the_line_is_ours(endpoint, tmp_path):
+    text = f'{{ mode: "client", connect: {{ endpoints: ["{endpoint}"] }} }}'
+    (tmp_path / "mine.json5").write_text(text)
+    with pytest.raises(ZenohError, match=f"nobody answers at {re.escape(endpoint)}$"):
+        open_client(endpoint, tmp_path / "mine.json5")
 
 
 def test_a_certificate_that_is_missing_is_one_line_with_its_key(tmp_path):

@@ -98,12 +98,17 @@ class View:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     default = Settings()
-    parser.add_argument("joint", type=Path, metavar="JOINT")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="end after so long")
-    parser.add_argument("--deadline", type=float, default=default.deadline_s, help="dead man, s")
-    parser.add_argument("--identify", type=float, default=default.identify_s, help="identification, s")
+    parser.add_argument("joint", type=Path, metavar="JOINT", help="joint file")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="end after so many seconds")
+    parser.add_argument(
+        "--deadline", type=float, default=default.deadline_s, help="oldest estimate to act on, s"
+    )
+    parser.add_argument(
+        "--identify", type=float, default=default.identify_s, help="length of the identification, s"
+    )
     parser.add_argument("--torque", type=float, default=default.torque_nm, help="limit, N·m at the joint")
-    parser.add_argument("--reaction", choices=["stop", "retract", "soften"], default=default.reaction)
+    how = {"choices": ["stop", "retract", "soften"], "default": default.reaction}
+    parser.add_argument("--reaction", **how, help="what a contact makes the link do (default: %(default)s)")
     parser.add_argument(
         "--json", action="store_true", help="print changes of phase as JSON, and nothing else"
     )

@@ -297,7 +297,7 @@ def add_number(
         how: further arguments of `add_argument`.
     """
     lower = "above 0" if least is None else f"from {least:g}" if most < math.inf else f"of {least:g} or more"
-    upper = "" if most == math.inf else f" to {most:g}"
+    upper = "" if most == math.inf else f"{' and at most' if least is None else ' to'} {most:g}"
     expected = f"expected a {'whole ' if whole else ''}number {lower}{upper}"
 
     def number(text: str) -> float:

@@ -88,8 +88,10 @@ def run(args: argparse.Namespace) -> int:
         say = _Summary(args.out, recorder)
         recorder.run(lambda: stopped.is_set() or time.monotonic() >= end, say.tick)
         say.clear()
-    print(json.dumps(say.document()) if args.json else f"{args.out}: {say.text()}")
-    if not any(recorder.sink.counts.get(kind) for kind in ("sample", "estimate", "frame")):
+    empty = not any(recorder.sink.counts.get(kind) for kind in ("sample", "estimate", "frame"))
+    if args.json or not empty:
+        print(json.dumps(say.document()) if args.json else f"{args.out}: {say.text()}")
+    if empty:
         for path in (args.out, side_file(args.out)):
             if path.is_file():
                 path.unlink()

@@ -277,7 +277,7 @@ def close_session(session: zenoh.Session) -> None:
 def one_line(error: BaseException) -> str:
     """Return a zenoh error without locations in zenoh's sources."""
     text = " ".join(str(error).split())
-    if nobody := re.match(r"Unable to connect to any of \[(.+?)\](?:\.|$)", text):
+    if nobody := re.match(r"Unable to connect to any of \[(.+?)\](?:[.!]|$)", text):
         return "nobody answers at " + re.sub(r"Single\((.+?)\)", r"\1", nobody[1])
     return re.sub(r"\s+at /\S+?:\d+\.?(?=\]|\s|$)", "", text)
 

@@ -5,6 +5,8 @@
 
 mod columns;
 
+use std::f64::consts::TAU;
+
 use serde::{Deserialize, Serialize};
 
 pub use columns::*;
@@ -44,8 +46,9 @@ pub struct Balance {
     curve: Lanes<4, CURVE>,
     formed: Lanes<4, FORMED>,
     effects: Formed,
-    elastic: Channel,     // declared elastic effects, filtered as the spring's columns
+    elastic: Channel,      // declared elastic effects, filtered as the spring's columns
     resting: [Formed; 2], // share in which dry friction may be anything, and what that is of the declared one
+    standing: [Formed; 2], // share in which the rounding of θ and q does not change
     waves: [f64; 2],      // sin q and cos q
     stops: [f64; 3],
     last: f64, // φ that the stops have followed
@@ -69,6 +72,7 @@ impl Balance {
             effects: Formed::default(),
             elastic: Channel::rest(0.0),
             resting: [Formed::default(); 2],
+            standing: [Formed::default(); 2],
             waves: [0.0; 2],
             stops: [0.0; 3],
             last: 0.0,
@@ -94,7 +98,7 @@ impl Balance {
         self.torque = Channel::rest(torque);
         self.formed = Lanes::rest([0.0; FORMED]);
         (self.effects, self.elastic) = (Formed::default(), Channel::rest(0.0));
-        self.resting = [Formed::default(); 2];
+        (self.resting, self.standing) = ([Formed::default(); 2], [Formed::default(); 2]);
         self.rest_curve(phi);
     }
 
@@ -244,6 +248,23 @@ impl Balance {
         now[4..8].copy_from_slice(link[..2].as_flattened());
         now[11..15].copy_from_slice(link[2..].as_flattened());
         self.formed.smooth(&filters.main, now);
+    }
+
+    /// The same period of what rounding does. A reading that goes through its counts evenly is wrong by a wave, one a count.
+    pub fn feed_rounding(&mut self, filters: &Filters, link_rate: f64, noise: [f64; 2]) {
+        let rates = [self.position.light[1], link_rate];
+        for ((standing, rate), noise) in self.standing.iter_mut().zip(rates).zip(noise) {
+            let wave = TAU * rate / (12.0 * noise).sqrt().max(f64::MIN_POSITIVE);
+            standing.pass(filters, filters.gain(wave));
+        }
+    }
+
+    /// Variance of the filtered φ that rounding makes beyond what white noise does, rad²; `noise`: of θ and q; `white`: what the
+    /// filters leave of that.
+    #[must_use]
+    pub fn rounding(&self, noise: [f64; 2], white: f64) -> f64 {
+        let more = |(standing, noise): (&Formed, f64)| noise * (standing.main[0].powi(2) - white).max(0.0);
+        self.standing.iter().zip(noise).map(more).sum()
     }
 
     /// The row of this moment.

@@ -42,11 +42,11 @@ pub enum Closed {
 pub struct Readings {
     /// Variance of a row that their white noise makes, (N·m)².
     pub white: f64,
-    /// That of the positions' noise alone, which is in the columns, (N·m)².
-    pub positions: f64,
-    /// Variance of the filtered deflection that it makes, rad².
-    pub deflection: f64,
-    /// Resolution of the deflection, rad: rounding moves its zero by as much.
+    /// Covariance of the filtered φ and θ″ that it makes, rad², rad²/s², rad²/s⁴.
+    pub noise: [[f64; 2]; 2],
+    /// Variance that rounding adds to the row at hand where the positions hardly move, (N·m)².
+    pub rounding: f64,
+    /// Half the resolution of the deflection, rad: a reading that cuts off instead of rounding moves its zero by as much.
     pub resolution: f64,
 }
 

@@ -52,7 +52,7 @@ pub fn dot(z: &Row, c: &Row) -> f64 {
 }
 
 /// Σ a b, in four sums side by side.
-fn product(a: &[f64], b: &[f64]) -> f64 {
+pub fn product(a: &[f64], b: &[f64]) -> f64 {
     let (fours, rest) = (a.chunks_exact(4).zip(b.chunks_exact(4)), a.len() / 4 * 4..a.len());
     let mut sums = [0.0; 4];
     fours.for_each(|(a, b)| (0..4).for_each(|k| sums[k] += a[k] * b[k]));
@@ -105,14 +105,18 @@ impl Gram {
         }
     }
 
-    /// The noise in functions of a signal that has this variance of it: each with the column of its slope, and by what that
-    /// is multiplied.
+    /// The noise in functions of signals that have this covariance of it: each with the column of its slope, by what that is
+    /// multiplied, and its signal.
     #[must_use]
-    pub fn noise(&self, functions: &[(usize, usize, f64)], variance: f64) -> Gram {
+    pub fn noise<const N: usize>(
+        &self,
+        functions: &[(usize, usize, f64, usize)],
+        covariance: &[[f64; N]; N],
+    ) -> Gram {
         let mut out = Gram { rows: self.rows, ..Gram::default() };
-        for (i, slope, factor) in functions {
-            for (j, other, more) in functions {
-                out.sums[*i][*j] = variance * factor * more * self.at(*slope, *other);
+        for (i, slope, factor, signal) in functions {
+            for (j, other, more, with) in functions {
+                out.sums[*i][*j] = covariance[*signal][*with] * factor * more * self.at(*slope, *other);
             }
         }
         out

@@ -29,6 +29,8 @@ pub struct Moment<'a> {
     pub time: f64,
     /// Whether the filters hold nothing wrong.
     pub usable: bool,
+    /// Variances of the noise of θ and q, rad².
+    pub noise: [f64; 2],
 }
 
 /// What the inputs are shifted by, before anything is learned from them.
@@ -224,7 +226,7 @@ impl Side {
 
     /// One period of all channels of motor `i`.
     pub fn feed(&mut self, filters: &Filters, i: usize, moment: &Moment) {
-        let Moment { now, last, link, time, usable } = *moment;
+        let Moment { now, last, link, time, usable, noise } = *moment;
         let (theta, phi, torque) = (now.at.motor[i], now.at.deflection(i), now.torque[i]);
         let few = self.blocks.are_few();
         // No spring is deflected beyond where its law ends.
@@ -238,6 +240,7 @@ impl Side {
         self.balance.read(filters, theta, torque);
         self.feed_effects(phi, link, time);
         self.balance.feed(filters, phi, link, &self.declared);
+        self.balance.feed_rounding(filters, link.light[1], noise);
         self.followed_s -= self.period;
         self.held_s += self.period;
         if !self.rigid {
@@ -302,19 +305,21 @@ impl Side {
 
     /// The row of this moment; what has been found to be shifted.
     ///
-    /// `noise`: variances of θ and q; `torque_noise`: of τ; `gains`: of the filters for white noise.
+    /// `noise`: variances of θ and q; `torque_noise`: of τ; `gains`: of the filters for white noise
     pub fn learn(&mut self, noise: [f64; 2], torque_noise: f64, gains: &[f64; 3]) -> Option<Shift> {
         self.held_s = 0.0;
         self.unconfirmed_s -= self.period;
         let positions = noise[0] + noise[1];
         self.blocks.seen = self.balance.seen();
-        let in_columns =
-            gains[0] * self.stiffness.powi(2) * positions + gains[2] * self.inertia.powi(2) * noise[0];
+        let [deflection, both, acceleration] =
+            [gains[0] * positions, gains[1] * noise[0], gains[2] * noise[0]];
+        let in_columns = self.stiffness.powi(2) * deflection + self.inertia.powi(2) * acceleration;
+        let rounding = self.balance.rounding(noise, gains[0]);
         self.blocks.readings = Readings {
             white: in_columns + gains[0] * torque_noise,
-            positions: in_columns,
-            deflection: gains[0] * positions,
-            resolution: (12.0 * positions).sqrt(),
+            noise: [[deflection, both], [both, acceleration]],
+            rounding: self.stiffness.powi(2) * rounding,
+            resolution: (3.0 * positions).sqrt(),
         };
         let row = self.balance.row();
         let closed = self.blocks.add(&row, self.balance.resting())?;

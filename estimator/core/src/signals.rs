@@ -36,6 +36,12 @@ impl Filters {
         squares
     }
 
+    /// |F| at a frequency, rad/s.
+    #[must_use]
+    pub fn gain(&self, frequency: f64) -> f64 {
+        (1.0 + (frequency / self.main.bandwidth).powi(2)).powi(-2)
+    }
+
     /// Rows that the filters make of one independent error: the length of their impulse response over a period.
     #[must_use]
     pub fn correlated_rows(&self, period_s: f64) -> f64 {

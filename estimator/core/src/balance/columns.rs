@@ -43,11 +43,12 @@ pub const TORQUE_SECOND: usize = 36;
 /// −q′: with θ′ the rate of the deflection, for a damping of the transmission.
 pub const LINK_RATE: usize = 37;
 
-/// Functions of u: their columns, those of their slopes, and by what these are multiplied.
+/// Functions of u, and θ″: their columns, those of their slopes, by what these are multiplied, and 0 or 1.
 #[must_use]
-pub fn slopes() -> [(usize, usize, f64); TERMS + 1] {
-    std::array::from_fn(|k| match k {
-        TERMS => (CORNER, UNEVEN, 2.0),
-        _ => (SPRING.start + k, SLOPE.start + k, 1.0),
+pub fn slopes() -> [(usize, usize, f64, usize); TERMS + 2] {
+    std::array::from_fn(|k| match k.checked_sub(TERMS) {
+        None => (SPRING.start + k, SLOPE.start + k, 1.0, 0),
+        Some(0) => (CORNER, UNEVEN, 2.0, 0),
+        Some(_) => (ACCELERATION, OFFSET, 1.0, 1),
     })
 }

@@ -4,10 +4,10 @@ use super::Blocks;
 use super::solve::{ALONE, Rows};
 use crate::choices::{ALIKE, EVEN, EXACT, FEWEST, UNLIKE};
 use crate::gram::{
-    Frame, Matrix, Posterior, Prior, UNKNOWNS, by_prior, cluster, log_evidence, set, solve, unknowns,
+    Frame, Matrix, Posterior, Prior, UNKNOWNS, by_prior, cluster, log_evidence, product, set, solve, unknowns,
 };
 use crate::student::t_95;
-use crate::unknowns::{DRY, INERTIA, LATE, OFFSET, SPRING, ZERO};
+use crate::unknowns::{DRY, OFFSET, ZERO};
 
 impl Blocks {
     /// What the groups that were not chosen, or a zero elsewhere, may change: the covariance between models, by their
@@ -49,23 +49,12 @@ impl Blocks {
         between
     }
 
-    /// Errors in variables: noise of the positions is in the columns, and takes its share off all that multiplies them: its
-    /// power over what tells of their scale. Where the torque is hardly more than what is measured of the motion makes
-    /// it, as of a joint that is guided by hand, that is much of it.
-    pub(super) fn attenuated(&self, chosen: &Posterior, rows: f64, noise: f64) -> Matrix {
-        let mut scale = chosen.x;
-        for (i, unknown) in SPRING.enumerate() {
-            scale[unknown] =
-                if i == 0 || self.spring.law.is_polynomial() { self.spring.alpha[i] } else { 0.0 };
-        }
-        (scale[ZERO], scale[LATE]) = (0.0, 0.0);
-        let open = chosen.covariance[INERTIA][INERTIA] / chosen.x[INERTIA].powi(2);
-        let share = (self.readings.positions * rows / noise * open).min(1.0);
-        let mut out = [[0.0; UNKNOWNS]; UNKNOWNS];
-        for i in unknowns(chosen.set) {
-            unknowns(chosen.set).for_each(|j| out[i][j] = share * share * scale[i] * scale[j]);
-        }
-        out
+    /// Errors in variables: noise of the positions is in the columns, and takes off what multiplies them, more where few rows
+    /// tell one from another.
+    pub(super) fn attenuated(&self, rows: &Rows, chosen: &Posterior) -> Matrix {
+        let pull = rows.reduced.pull(&chosen.x, chosen.set);
+        let moved = chosen.covariance.map(|row| product(&row, &pull) / rows.noise);
+        moved.map(|a| moved.map(|b| a * b))
     }
 
     /// What the chosen unknowns leave beyond the noise is an error of the model: scores of blocks hold it.

@@ -119,10 +119,11 @@ impl Blocks {
         }
     }
 
-    /// What the positions' noise adds to the products of the spring's columns.
+    /// What the positions' noise adds to the products of the columns.
     fn noise_of_columns(&self, total: &Gram) -> Gram {
-        let of_u = self.readings.deflection / self.deflection.powi(2);
-        total.noise(&balance::slopes(), of_u)
+        let [[phi, both], [_, acceleration]] = self.readings.noise;
+        let both = both / self.deflection;
+        total.noise(&balance::slopes(), &[[phi / self.deflection.powi(2), both], [both, acceleration]])
     }
 
     /// The unknowns from all blocks.
@@ -165,7 +166,7 @@ impl Blocks {
             }
             self.friction = frame.rms(&total, &chosen, shaped());
             let omitted = self.omitted(&rows, &chosen, &used);
-            let attenuated = self.attenuated(&chosen, total.rows, noise);
+            let attenuated = self.attenuated(&rows, &chosen);
             self.widen(&frame, &mut chosen, &used, noise, own);
             let more = omitted.iter().flatten().zip(attenuated.iter().flatten());
             let entries = chosen.covariance.iter_mut().flatten().zip(more);

@@ -85,10 +85,18 @@ pub struct Reduced {
 impl Reduced {
     /// What noise of the columns these unknowns leave in the rows.
     pub(super) fn left_noise(&self, x: &Vector, set: Set) -> f64 {
+        let pull = self.pull(x, set);
+        pull[0] - product(&pull, x)
+    }
+
+    /// Products of each column's noise with what of it these unknowns leave: least squares takes them for the rows' own.
+    #[must_use]
+    pub fn pull(&self, x: &Vector, set: Set) -> Vector {
         let mut with_left = *x;
         with_left[0] = -1.0;
-        let of = |i: usize| with_left[i] * product(&self.noise[i], &with_left);
-        of(0) + unknowns(set).map(of).sum::<f64>()
+        let mut out = [0.0; UNKNOWNS];
+        std::iter::once(0).chain(unknowns(set)).for_each(|i| out[i] = -product(&self.noise[i], &with_left));
+        out
     }
 }
 

@@ -124,7 +124,7 @@ fn a_column_that_leaves_less_of_the_noise_of_another_one_is_no_evidence() {
     let (gram, frame) = (sum(&read), plain(0b110));
     let left = gram.quadratic(&frame.residual(&[gain; UNKNOWNS], 0b10)) / gram.rows;
     let of_column = left / gain.powi(2); // its variance
-    let noisy = frame.reduce_noisy(&gram, &gram.noise(&[(1, 3, 1.0)], of_column));
+    let noisy = frame.reduce_noisy(&gram, &gram.noise(&[(1, 3, 1.0, 0)], &[[of_column]]));
     let odds = |reduced: &Reduced| {
         log_evidence(reduced, 0b110, &prior, left) - log_evidence(reduced, 0b10, &prior, left)
     };
@@ -236,4 +236,36 @@ fn sums_of_directions_that_cancel_stay_positive_definite() {
     let found = solve(&frame.reduce(&sum(&rows)), frame.set, &wide(), 1e-9).unwrap();
     assert!(found.x.iter().all(|x| x.abs() < 1e12), "{:?}", found.x);
     assert!(found.log_evidence < 0.0);
+}
+
+#[test]
+fn noise_of_columns_pulls_what_multiplies_them() {
+    // Both columns are read with the same noise, with opposite signs: least squares errs by what is foreseen.
+    let (x, deviation, n, mut seed) = ([0.0, 5.0, -3.0], 0.1, 20000, 7);
+    let variance = 4.0 / 3.0 * deviation * deviation; // uniform within twice the deviation
+    let read: Vec<Row> = (0..n)
+        .map(|_| {
+            let (one, other, error) =
+                (noise(&mut seed), noise(&mut seed), 2.0 * deviation * noise(&mut seed));
+            let mut row = [0.0; COLUMNS];
+            (row[0], row[1], row[2], row[3]) = (x[1] * one + x[2] * other, one + error, other - error, 1.0);
+            row
+        })
+        .collect();
+    let (gram, frame) = (sum(&read), plain(0b110));
+    let covariance = [[variance, -variance], [-variance, variance]];
+    let reduced = frame.reduce_noisy(&gram, &gram.noise(&[(1, 3, 1.0, 0), (2, 3, 1.0, 1)], &covariance));
+    let prior = Prior::independent([0.0; UNKNOWNS], &[1e3; UNKNOWNS]);
+    let found = solve(&reduced, 0b110, &prior, 1.0).unwrap();
+    // By the true unknowns it is exact, but for what n rows leave of noise, some 0.01.
+    let mut truth = [0.0; UNKNOWNS];
+    truth[..3].copy_from_slice(&x);
+    let pull = reduced.pull(&truth, 0b110);
+    for i in 1..3 {
+        let (foreseen, is) = (product(&found.covariance[i], &pull), found.x[i] - x[i]);
+        assert!(
+            is.abs() > 0.05 && (foreseen - is).abs() < 0.05,
+            "{foreseen} of {is}"
+        );
+    }
 }

@@ -62,7 +62,7 @@ impl Robust {
             let noise = self.noise_of(i);
             let torque_noise = self.live.torque_noise[i].variance(f64::INFINITY);
             let (side, link) = (&mut self.sides[i], &self.live.link);
-            side.feed(&self.filters, i, &Moment { now, last: &self.live.last, link, time, usable });
+            side.feed(&self.filters, i, &Moment { now, last: &self.live.last, link, time, usable, noise });
             if side.rigid {
                 continue;
             }

@@ -173,12 +173,6 @@ impl SampleValidator {
         &self.memory.steps
     }
 
-    /// Samples for which neither a motor's position nor the link's has changed.
-    #[must_use]
-    pub fn stood(&self, motor: usize) -> u32 {
-        self.memory.runs[motor].min(self.memory.runs[self.motors])
-    }
-
     fn watched(&self) -> usize {
         self.motors + usize::from(self.flexible)
     }

@@ -73,8 +73,7 @@ impl Robust {
                 let gain = self.rate_gain * (noise[0] + noise[1]).sqrt();
                 side.update_excitation(link, now.at.deflection(i), gain, usable, look_s);
             }
-            // Where both readings stand, their rounding is no noise, and what they say has been said.
-            if usable && side.excited && u64::from(self.validator.stood(i)) <= self.looks {
+            if usable && side.excited {
                 side.blocks.spoilt = self.live.refused.is_some();
                 shifts[i] = side.learn(noise, torque_noise, &self.noise_gains);
             }

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from estimator import (
+    Effect,
     EstimatorError,
     EstimatorSettings,
     JointModel,
@@ -51,6 +52,7 @@ def played(record: Record, motor: Motor):
 
 
 EXACT = "motor_counts=0 link_bits=0 seconds=2"
+COARSE = "motor_counts=262144 link_bits=17 torque_noise=0.0036"
 
 
 @pytest.mark.parametrize(
@@ -239,3 +241,29 @@ def test_a_late_reading_that_no_effect_stands_in_for_is_diagnosed():
     moved = joint.moved(12.0, 54, **motion.MOTIONS[2]).record
     outcome = diagnose(moved, joint.model)
     assert [one.name for one in outcome.effects] == ["encoder_delay"]
+
+
+def test_a_motor_that_sticks_where_it_turns_is_no_late_torque():
+    joint = (
+        f"stiffness=50 inertia=0.015 damping=0.065 link_inertia=0.07 link_damping=0.016 gravity=1.1 {COARSE}"
+    )
+    world = simulated(f"{joint} friction=coulomb coulomb=0.15 size=2 top_hz=4 seconds=14 period=0.002 seed=3")
+    spring = Transmission(order=1, parameters={"coefficients_nm_rad": (50.0,)}, covariance=((0.07,),))
+    friction = Effect(name="coulomb_friction", parameters={"torque_nm": 0.15, "smoothing_rad_s": 0.004})
+    motor = Motor(
+        inertia_kg_m2=0.015,
+        viscous_damping_nm_s_rad=0.052,
+        transmission=spring,
+        effects=(friction,),
+        fit_rms_nm=(0.015, 1.06),
+    )
+    model = JointModel(arrangement="single", motors=(motor,))
+    estimator = make_estimator(model, EstimatorSettings(), world.record.period_s)
+    said = [
+        (one.flexibility_torque_nm, int(one.status)) for one in map(estimator.step, world.record.samples())
+    ]
+    torque, status = np.array(said).T
+    valid = status.astype(int) & Status.TORQUE_VALID > 0
+    truth = world.columns["true_flexibility_torque_nm"]
+    assert np.mean(valid) > 0.9
+    assert np.max(np.abs(torque - truth)[valid]) < 0.1 * np.std(truth)

@@ -280,6 +280,7 @@ impl Balance {
         row[SPRING.start..SPRING.start + 2 * TERMS].copy_from_slice(&curve[..2 * TERMS]);
         row[CLIPS].copy_from_slice(&curve[2 * TERMS..CURVE - 2]);
         (row[UNEVEN], row[CORNER]) = (curve[CURVE - 2], curve[CURVE - 1]);
+        row[DRY_RATE] = self.formed.state[1][0];
         let formed = &self.formed.state[0];
         let places = [DRY, SOFT, LOAD[0], LOAD[1]];
         let ranges = LATE.chain(READ).chain(STOPS).chain(SINE).chain(COSINE).chain([LINK_RATE]);

@@ -1,5 +1,4 @@
-//! The unknowns of a motor's balance: what each adds to a row, what is believed of it before any data, and what
-//! torque and stiffness they make at a deflection.
+//! The unknowns of a motor's balance: what each adds to a row, its prior, and what they make at a deflection.
 
 mod candidates;
 mod prior;
@@ -10,7 +9,7 @@ use serde::{Deserialize, Serialize};
 pub use candidates::CANDIDATES;
 pub use reading::Reading;
 
-use crate::balance::{self};
+use crate::balance;
 use crate::choices::REACHED;
 use crate::gram::{COLUMNS, Frame, Gram, Matrix, Posterior, Row, Set, UNKNOWNS, Vector, set};
 use crate::laws::{Alpha, Law, PARAMETERS};
@@ -35,22 +34,24 @@ pub const LATE: usize = 11;
 pub const TORQUE_LATE: usize = 12;
 /// Of its second derivative, s²: half the square of a delay, zero of a lag.
 pub const TORQUE_BEND: usize = 13;
+/// Dry friction that changes its sign earlier than the filtered velocity, N·m·s.
+pub const DRY_LATE: usize = 14;
 /// Friction that grows with speed before it is full, N·m.
-pub const SOFT: usize = 14;
+pub const SOFT: usize = 15;
 /// Friction that grows with the load, N·m at the largest deflection.
-pub const LOAD: std::ops::Range<usize> = 15..17;
+pub const LOAD: std::ops::Range<usize> = 16..18;
 /// Damping of the transmission, N·m·s/rad.
-pub const RATE: usize = 17;
+pub const RATE: usize = 18;
 /// Memory of the transmission, N·m at half the range.
-pub const STOPS: std::ops::Range<usize> = 18..21;
+pub const STOPS: std::ops::Range<usize> = 19..22;
 /// A spring of any shape, N·m at half the range.
-pub const CLIPS: std::ops::Range<usize> = 21..25;
+pub const CLIPS: std::ops::Range<usize> = 22..26;
 /// A corner of the stiffness at zero, N·m at the largest deflection.
-pub const CORNER: std::ops::Range<usize> = 25..26;
+pub const CORNER: std::ops::Range<usize> = 26..27;
 /// A spring that is stiffer to one side: of |φ|, N·m at the largest deflection, and of φ², N·m/rad².
-pub const ASYMMETRY: std::ops::Range<usize> = 26..28;
+pub const ASYMMETRY: std::ops::Range<usize> = 27..29;
 /// What the link encoder reads too little, by sin q and cos q, rad.
-pub const ECCENTRIC: std::ops::Range<usize> = 28..30;
+pub const ECCENTRIC: std::ops::Range<usize> = 29..31;
 
 /// Those that every joint has.
 pub const ACTIVE: Set = (1 << TORQUE_LATE) - 2;
@@ -306,15 +307,15 @@ impl Spring {
             (DAMPING, balance::VELOCITY),
             (OFFSET, balance::OFFSET),
             (DRY, balance::DRY),
+            (DRY_LATE, balance::DRY_RATE),
             (SOFT, balance::SOFT),
             (RATE, balance::VELOCITY),
             (RATE, balance::LINK_RATE),
             (ASYMMETRY.start, balance::UNEVEN),
             (CORNER.start, balance::CORNER),
         ];
-        let ranges =
-            STOPS.zip(balance::STOPS).chain(CLIPS.zip(balance::CLIPS)).chain(LOAD.zip(balance::LOAD));
-        for (unknown, column) in plain.into_iter().chain(ranges) {
+        let own = STOPS.zip(balance::STOPS).chain(CLIPS.zip(balance::CLIPS)).chain(LOAD.zip(balance::LOAD));
+        for (unknown, column) in plain.into_iter().chain(own) {
             frame.directions[unknown][column] = 1.0;
         }
         let nodes = projection.nodes();

@@ -42,6 +42,8 @@ pub const COSINE: std::ops::Range<usize> = 34..36;
 pub const TORQUE_SECOND: usize = 36;
 /// −q′: with θ′ the rate of the deflection, for a damping of the transmission.
 pub const LINK_RATE: usize = 37;
+/// The rate of the sign of θ′: dry friction that changes at another moment, N·m/s.
+pub const DRY_RATE: usize = 38;
 
 /// Functions of u, and θ″: their columns, those of their slopes, by what these are multiplied, and 0 or 1.
 #[must_use]

@@ -11,7 +11,7 @@ use crate::choices::{ACCUSED, DRIFTED, REACHED, SURE, USEFUL};
 use crate::gram::{Gram, Posterior, Prior, Set, UNKNOWNS, Vector, inverse, set, solve};
 use crate::spring::{Projection, TERMS};
 use crate::unknowns::{
-    ACTIVE, CLIPS, DRY, ECCENTRIC, INERTIA, LOAD, OFFSET, RATE, SOFT, SPRING, Spring, ZERO,
+    ACTIVE, CLIPS, DRY, DRY_LATE, ECCENTRIC, INERTIA, LOAD, OFFSET, RATE, SPRING, Spring, ZERO,
 };
 
 const ZEROS: i32 = 12; // that are tried to either side, over the deflection seen
@@ -76,7 +76,7 @@ impl Blocks {
         } else if before.is_some() && !explained {
             self.spring.reset();
         } else {
-            self.carry_over(1 << ZERO | 1 << DRY | 1 << SOFT | !(anywhere() | set(SPRING)));
+            self.carry_over(1 << ZERO | 1 << DRY | set(DRY_LATE..LOAD.start) | !(anywhere() | set(SPRING)));
             if guessed {
                 // What was learned by a zero that was another one is of another spring.
                 self.before.iter_mut().for_each(|before| before.keep(1 << INERTIA));

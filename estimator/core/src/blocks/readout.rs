@@ -114,7 +114,8 @@ impl Blocks {
         if self.posterior.is_some() { self.quick.sqrt() } else { f64::NAN }
     }
 
-    /// Names of the effects that nobody declared and evidence chose; a torque that is late by a part of a period is none.
+    /// Names of the effects that nobody declared and evidence chose; a torque that is late by a part of a period is none,
+    /// nor is the moment at which dry friction changes its sign.
     pub fn undeclared(&self) -> impl Iterator<Item = &'static str> {
         let chosen = self.posterior.as_ref().map_or(0, |posterior| posterior.set & !set(TORQUE_LATE..SOFT));
         let named = CANDIDATES.iter().filter(move |c| chosen & set(c.unknowns.clone()) != 0).map(|c| c.name);

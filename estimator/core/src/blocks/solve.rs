@@ -10,8 +10,8 @@ use crate::gram::{
 };
 use crate::laws::{Law, PARAMETERS};
 use crate::unknowns::{
-    ACTIVE, ASYMMETRY, CANDIDATES, CLIPS, DRY, ECCENTRIC, OFFSET, RATE, SOFT, SPRING, STOPS, Scale, Spring,
-    ZERO,
+    ACTIVE, ASYMMETRY, CANDIDATES, CLIPS, DRY, DRY_LATE, ECCENTRIC, OFFSET, RATE, SPRING, STOPS, Scale,
+    Spring, ZERO,
 };
 
 const WIDE: f64 = 1e6; // of a prior that says nothing
@@ -362,5 +362,5 @@ pub(super) fn rarity() -> f64 {
 
 /// Unknowns whose shapes no joint has quite: friction, memory, the free curve.
 fn shaped() -> Set {
-    set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS) | set(CLIPS)
+    set(DRY..SPRING.start) | set(DRY_LATE..RATE) | set(STOPS) | set(CLIPS)
 }

@@ -1,6 +1,6 @@
 //! Effects that the joint file need not name.
 
-use super::{ASYMMETRY, CLIPS, ECCENTRIC, LOAD, RATE, SOFT, STOPS, TORQUE_LATE};
+use super::{ASYMMETRY, CLIPS, DRY_LATE, ECCENTRIC, LOAD, RATE, SOFT, STOPS, TORQUE_LATE};
 
 /// One effect that the joint file need not name.
 pub struct Candidate {
@@ -11,8 +11,9 @@ pub struct Candidate {
 }
 
 /// The groups of unknowns that evidence chooses.
-pub const CANDIDATES: [Candidate; 8] = [
-    Candidate { unknowns: TORQUE_LATE..SOFT, name: "torque_delay" },
+pub const CANDIDATES: [Candidate; 9] = [
+    Candidate { unknowns: TORQUE_LATE..DRY_LATE, name: "torque_delay" },
+    Candidate { unknowns: DRY_LATE..SOFT, name: "coulomb_friction" },
     Candidate { unknowns: SOFT..SOFT + 1, name: "stribeck_friction" },
     Candidate { unknowns: LOAD, name: "load_dependent_friction" },
     Candidate { unknowns: RATE..RATE + 1, name: "transmission_damping" },

@@ -1,8 +1,8 @@
 //! What is believed of the unknowns before any data.
 
 use super::{
-    CORNER, DAMPING, DRY, ECCENTRIC, INERTIA, LATE, LOAD, OFFSET, SOFT, SPRING, Scale, Spring, TORQUE_BEND,
-    TORQUE_LATE, USUAL, ZERO,
+    CORNER, DAMPING, DRY, DRY_LATE, ECCENTRIC, INERTIA, LATE, LOAD, OFFSET, SPRING, Scale, Spring,
+    TORQUE_BEND, TORQUE_LATE, USUAL, ZERO,
 };
 use crate::balance;
 use crate::gram::{Frame, Gram, Prior, UNKNOWNS, inverse, set};
@@ -24,7 +24,7 @@ impl Spring {
             (rms(unknown).powi(2) - mean * mean).max(0.0).sqrt().max(1e-12)
         };
         let (mut mean, mut std) = ([0.0; UNKNOWNS], [1.0; UNKNOWNS]);
-        for unknown in SOFT..UNKNOWNS {
+        for unknown in DRY_LATE..UNKNOWNS {
             let gear = LOAD.contains(&unknown);
             let share = if gear { priors.load_dependent_friction } else { priors.undeclared };
             std[unknown] = share * torque / rms(unknown);

@@ -267,3 +267,13 @@ def test_a_motor_that_sticks_where_it_turns_is_no_late_torque():
     truth = world.columns["true_flexibility_torque_nm"]
     assert np.mean(valid) > 0.9
     assert np.max(np.abs(torque - truth)[valid]) < 0.1 * np.std(truth)
+
+
+def test_a_motor_that_sticks_where_it_turns_is_not_fitted_by_delays():
+    joint = "stiffness=580 inertia=0.072 damping=0.46 link_inertia=0.56 link_damping=0.05 gravity=1"
+    read = "motor_counts=131072 link_bits=17 torque_noise=0.017 seconds=14 seed=2"
+    record = simulated(f"{joint} friction=coulomb coulomb=0.21 size=5 top_hz=4 {read}").record
+    motor = Motor(inertia_kg_m2=0.072, viscous_damping_nm_s_rad=0.46)
+    (found,) = fit(record, JointModel(arrangement="single", motors=(motor,)))
+    assert (found.torque_delay_s, found.link_delay_s) == (0.0, 0.0)
+    assert found.viscous_damping_nm_s_rad == pytest.approx(0.46, rel=0.02)

@@ -15,7 +15,7 @@ from estimator.diagnosis.frame import Corrections, Frame
 from estimator.diagnosis.joint_priors import OF_RUN, effect_std, everyday, everyday_std, least
 from estimator.diagnosis.law_parameters import Base
 from estimator.diagnosis.regression import Scale
-from estimator.effects import STOP_EXPONENT, Coordinates
+from estimator.effects import LIBRARY, STOP_EXPONENT, Coordinates
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray
 
@@ -142,6 +142,18 @@ class Stack:
             column = np.concatenate([base.lever(f, held) for f in self._frames])
             width = PRIORS["transmission"].std * self._torque_rms / _rms_of(column)
             self._add(column, Slot("everyday", "lever", 1, None, 0, 0, 0.0), width)
+
+    def turns(self) -> None:
+        """Add the moment at which undeclared dry friction changes its sign, s times its torque."""
+        for i in np.flatnonzero(self._frames[0].flexible).tolist():
+            friction = Candidate(LIBRARY["coulomb_friction"], i)
+            if not any(everyday_std(self._frames, friction, self._torque_rms, self._calibrating)):
+                continue
+            speed, period_s = sign_smoothing(self._frames, i), self._frames[0].signals.light.period_s
+            signs = [np.gradient(np.tanh(f.motors[i].velocity / speed), period_s) for f in self._frames]
+            column = np.concatenate([f.column(i, x, None) for f, x in zip(self._frames, signs, strict=True)])
+            width = PRIORS["undeclared_effect"].std * self._torque_rms / _rms_of(column)
+            self._add(column, Slot("everyday", "friction_turns", i, None, 0, 0, 0.0), width)
 
     def everyday(self, without: set[tuple[str, int | None]], pinned: Pinned) -> None:
         """Add the everyday errors that are not terms."""

@@ -273,6 +273,7 @@ class Problem:
         stack = Stack(frames, corrections, self.declared, self.torque_rms, self.calibrating)
         stack.transmissions(base)
         stack.lever(base)
+        stack.turns()
         stack.everyday({t.candidate.key for t in terms}, pinned)
         for k, term in enumerate(terms):
             stack.term(k, term)

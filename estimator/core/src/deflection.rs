@@ -140,26 +140,28 @@ impl DeflectionFilter {
         self.x[2] + ahead_s * (self.x[3] + 0.5 * ahead_s * self.x[4])
     }
 
-    /// φ now: foreseen from the moment of the torque, and corrected by the latest reading, whose noise is R.
+    /// φ now, and its variance, rad²: foreseen from the moment of the torque, and corrected by the latest reading, whose
+    /// noise is R.
     ///
     /// What is foreseen has the variance that P grows to by the random third derivative.
     #[must_use]
-    pub fn now(&self, present: &Present) -> f64 {
-        let t = present.behind_s;
-        let foreseen = self.at(t + present.ahead_s);
-        if t == 0.0 {
-            return foreseen;
-        }
-        let share = self.p.map_or(1.0, |p| {
-            let slope = [1.0, t, 0.5 * t * t];
-            let grown: f64 = (0..3)
-                .flat_map(|i| (0..3).map(move |j| (i, j)))
-                .map(|(i, j)| slope[i] * p[2 + i][2 + j] * slope[j])
-                .sum();
-            let variance = self.motion.missed.max(1.0) * (grown + self.wander * t.powi(5) / 20.0);
-            variance / (variance + self.noise)
+    pub fn now(&self, present: &Present) -> (f64, f64) {
+        let (read, now) = (present.behind_s, present.behind_s + present.ahead_s);
+        let [by_then, by_now] = [self.grown(read), self.grown(now)];
+        let share = if read > 0.0 { self.p.map_or(1.0, |_| by_then / (by_then + self.noise)) } else { 0.0 };
+        let phi = self.at(now) + share * (present.phi - self.at(read));
+        (phi, (by_now - share * by_then).max(0.0))
+    }
+
+    /// Variance of φ, so long after the moment of the torque, as the filter's own innovations bear it out, rad².
+    fn grown(&self, t: f64) -> f64 {
+        let slope = [1.0, t, 0.5 * t * t];
+        let all = self.p.map_or(0.0, |p| {
+            let pairs = (0..3).flat_map(|i| (0..3).map(move |j| (i, j)));
+            pairs.map(|(i, j)| slope[i] * p[2 + i][2 + j] * slope[j]).sum::<f64>()
+                + self.wander * t.powi(5) / 20.0
         });
-        foreseen + share * (present.phi - self.at(t))
+        self.motion.missed.max(1.0) * all
     }
 
     /// φ′ at the last sample, rad/s.
@@ -172,12 +174,6 @@ impl DeflectionFilter {
     #[must_use]
     pub fn link_rate(&self) -> f64 {
         self.x[1] + self.x[3]
-    }
-
-    /// Variance of φ, as the filter's own innovations bear it out, rad².
-    #[must_use]
-    pub fn variance(&self) -> f64 {
-        self.p.map_or(0.0, |p| p[2][2] * self.motion.missed.max(1.0))
     }
 
     /// One period later: measured θ and φ, the torque that acted, τ + τ_e − x, N·m, and the stiffness where it did; 0: it is
@@ -314,85 +310,4 @@ impl DeflectionFilter {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_deflection_that_bends_steadily_is_followed_without_delay() {
-        let mut filter = DeflectionFilter::new(0.1, 0.5, 60.0, 1e-3, 0.03);
-        filter.restart(0.0, 0.0);
-        for k in 1..3000 {
-            let t = f64::from(k) * 1e-3;
-            filter.update(0.2 * t, 0.1 * t + 0.3 * t * t, 0.0, 0.0);
-        }
-        assert!((filter.at(0.0) - (0.1 * 2.999 + 0.3 * 2.999 * 2.999)).abs() < 1e-6);
-        assert!((filter.link_rate() - (0.2 + 0.1 + 0.6 * 2.999)).abs() < 1e-4);
-    }
-
-    #[test]
-    fn a_steep_spring_behind_a_coarse_encoder_is_followed_better_than_it_is_read() {
-        let (t, inertia, damping, count) = (1e-3, 0.1, 1.2, 7.7e-4);
-        let spring = |phi: f64| {
-            let stiffness = 4.5 * (6.6 * phi.abs()).exp();
-            ((stiffness - 4.5) / 6.6 * phi.signum(), stiffness)
-        };
-        let (theta, phi) = (|s: f64| 0.8 * (7.0 * s).sin(), |s: f64| 0.45 * (12.0 * s).sin());
-        let mut filter = DeflectionFilter::new(inertia, damping, 60.0, t, 0.03);
-        let tuning = Tuning {
-            jerk: 0.45 * 12.0_f64.powi(3),
-            motor_noise: count * count / 12.0,
-            link_noise: 1e-10,
-            inertia,
-            damping,
-            rate_damping: 0.0,
-            unmodelled: 0.01,
-        };
-        filter.restart(0.0, 0.0);
-        let mut square = 0.0;
-        for k in 1..6000 {
-            let (now, before) = (f64::from(k) * t, (f64::from(k) - 0.5) * t);
-            let acceleration = -49.0 * theta(before);
-            let torque =
-                inertia * acceleration + damping * 5.6 * (7.0 * before).cos() - spring(phi(before)).0;
-            let read = (theta(now) / count).round() * count;
-            let (acting, stiffness) = spring(filter.at(0.0));
-            filter.update(read, theta(now) + phi(now) - read, torque + acting, stiffness);
-            if k % 30 == 0 {
-                filter.tune(&tuning);
-            }
-            if k > 3000 {
-                square += (filter.at(0.0) - phi(now)).powi(2) / 2999.0;
-            }
-        }
-        assert!(square < tuning.motor_noise / 9.0, "{} of {}", square.sqrt(), tuning.motor_noise.sqrt());
-        assert!((0.5..2.0).contains(&(square / filter.variance())), "{square} of {}", filter.variance());
-    }
-
-    #[test]
-    fn dampings_that_cancel_each_other_make_no_filter_unstable() {
-        let (damping, stiffness) = (28.0, 1000.0);
-        let mut filter = DeflectionFilter::new(0.0275, 0.0, 60.0, 2e-3, 0.02);
-        let tuning = Tuning {
-            jerk: 0.5,
-            motor_noise: 1e-10,
-            link_noise: 1e-10,
-            inertia: 0.0275,
-            damping: -damping,
-            rate_damping: damping,
-            unmodelled: 0.1,
-        };
-        filter.restart(0.0, 0.0);
-        let mut worst: f64 = 0.0;
-        for k in 1..5000 {
-            let theta = 0.008 * (f64::from(k) * 2e-3).sin() + 1e-5 * (f64::from(k) * 2.3).sin();
-            let acting = stiffness * filter.at(0.0) + damping * filter.rate();
-            filter.update(theta, -theta, stiffness * theta + acting, stiffness);
-            if k % 10 == 0 {
-                filter.tune(&tuning);
-            }
-            worst = worst.max((filter.at(0.0) + theta).abs());
-        }
-        assert!(worst < 1e-4, "{worst}");
-        assert_eq!(filter.unsettled, 0);
-    }
-}
+mod tests;

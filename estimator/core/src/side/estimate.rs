@@ -20,7 +20,7 @@ impl Side {
         if self.rigid {
             return TransmissionEstimate { flexibility_torque: left(), ..nothing };
         }
-        let read = self.deflection.now(present);
+        let (read, of_read) = self.deflection.now(present);
         let phi = read + self.effects.kinematic_error(self.theta - self.effects.offset);
         let Some(at) = self.blocks.at(phi, self.deflection.link_rate(), &self.balance) else {
             return TransmissionEstimate { flexibility_torque: left(), deflection: read, ..nothing };
@@ -31,7 +31,7 @@ impl Side {
         // A curve is as uncertain as its parameters, and as φ is where it bends.
         let std = |by: &Vector, slope: f64, value: f64| {
             let variance = self.blocks.posterior.as_ref().map_or(f64::NAN, |known| known.variance_along(by));
-            (variance + slope.powi(2) * self.deflection.variance() + (held * value).powi(2)).sqrt()
+            (variance + slope.powi(2) * of_read + (held * value).powi(2)).sqrt()
         };
         let stiffness_std = std(&at.by_stiffness, at.bend, stiffness).hypot(at.within_piece.sqrt());
         let (flexibility_torque, flexibility_torque_std) = if self.fits && at.stiffness > 0.0 {

@@ -263,9 +263,6 @@ fn noise_of_columns_pulls_what_multiplies_them() {
     let pull = reduced.pull(&truth, 0b110);
     for i in 1..3 {
         let (foreseen, is) = (product(&found.covariance[i], &pull), found.x[i] - x[i]);
-        assert!(
-            is.abs() > 0.05 && (foreseen - is).abs() < 0.05,
-            "{foreseen} of {is}"
-        );
+        assert!(is.abs() > 0.05 && (foreseen - is).abs() < 0.05, "{foreseen} of {is}");
     }
 }

@@ -160,7 +160,7 @@ class Consistency(NamedTuple):
     link_flexibility_torque_rms_nm: float  # of the link side's
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
 class Record:
     """A recording: n samples of m motors on a grid of whole periods.
 

@@ -144,6 +144,14 @@ def test_several_quantities_are_spoken_of_in_the_plural():
     assert "times the declared inertia (or else: the positions look like degrees" in said, said
 
 
+def test_a_recording_is_judged_once_by_all_who_ask():
+    drawn = gatekit.draw("soft", 5)
+    judgement = judge(drawn.record, drawn.model)
+    assert judge(drawn.record, replace(drawn.model)) is judgement
+    assert judge(replace(drawn.record), drawn.model) is not judgement
+    assert judge(drawn.record, replace(drawn.model, period_s=1.0)) is not judgement
+
+
 def test_a_torque_that_is_only_noise_and_a_short_recording_decide_nothing():
     drawn = gatekit.draw("soft", 5)
     noise = np.random.default_rng(1).normal(0.0, 1e-3, drawn.record.motor_torque_nm.shape)

@@ -50,7 +50,7 @@ def diagnose(
     everything = records + ([] if validation is None else [validation])
     for one in everything:
         check(one, model)
-    model = without_hold(everything, model)
+    declared = model = without_hold(everything, model)
     progress("bandwidth")
     bandwidth = choose_bandwidth(records, model) if bandwidth_hz is None else bandwidth_hz
     require_bandwidth(bandwidth, records)
@@ -80,7 +80,7 @@ def diagnose(
             break
         judge, outcome = other, raised
     outcome = replace(outcome, smoothing_rad_s=smoothing_rad_s)
-    if outcome.verdict == "sufficient" and any(asks(records, model)):
+    if outcome.verdict == "sufficient" and any(asks(records, declared)):
         return replace(outcome, verdict="insufficient_excitation")
     return outcome
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from estimator.transmissions import transmission_model
 __all__ = ["Discrepancy", "Judgement", "examine", "judge"]
 
 _TURN = 2.0 * math.pi
+_known: WeakKeyDictionary[Record, tuple[JointModel, Judgement]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,6 +215,7 @@ def judge(record: Record, model: JointModel) -> Judgement:
     findings, every cause that is not decisively less likely than "as declared" is
     listed as undecided: the sign of a link that is held, for example. Where a controller that holds the motor
     explains the torque as well as a finding does, no balance is better than undeclared friction leaves it.
+    A recording that a verb and its fit ask about is judged once.
 
     Args:
         record: the recording.
@@ -225,6 +228,14 @@ def judge(record: Record, model: JointModel) -> Judgement:
         raise EstimatorError(
             f"recording: expected {counted(len(model.motors), 'motor')}, got {record.motors}"
         )
+    known = _known.get(record)
+    if known is None or known[0] != model:
+        known = _known[record] = model, _judged(record, model)
+    return known[1]
+
+
+def _judged(record: Record, model: JointModel) -> Judgement:
+    """Judge a recording that has the model's motors."""
     if len(record) < whole("samples"):
         return Judgement(reason=f"{len(record)} samples, expected at least {whole('samples')}")
     joint = _Joint(record, model, _balances(record, model))

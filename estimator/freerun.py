@@ -138,7 +138,7 @@ class Bodies:
         self.record, self.model, self.m = record, model, len(model.motors)
         self.time = record.time_s
         self.laws = [_law(motor.transmission) for motor in model.motors]
-        self.carried = model.link is not None and self.laws[0] is None
+        self.carried = self.laws[0] is None
         self.swings = model.link is not None and not self.carried
         self.alphas = [
             law.alpha(motor.transmission.parameters) if law else np.zeros(0)
@@ -240,7 +240,7 @@ class Bodies:
     def acceleration(self, x: FloatArray, v: FloatArray, row: NDArray[np.int64]) -> FloatArray:
         """Return the accelerations of states (w, m + 1) and rates at these rows."""
         force = self.torque[row] - self.given[row]
-        if self.model.link is not None:
+        if self.carried or self.swings:
             force[:, -1] -= self._link_load(x[:, -1], v[:, -1])
         second = self.model.arrangement == "antagonistic"
         for i, motor in enumerate(self.model.motors):
@@ -326,7 +326,7 @@ class Bodies:
         own.append(1.0 if link is None else link.inertia_kg_m2)
         for j, mine in enumerate([*self.elements, self.link_elements]):
             own[j] += float(_sum([e for e in mine if _is_inertia(e[0])], one)[0])
-        if self.carried:
+        if self.carried and link is not None:
             own[0] += own[-1]
         return np.array(own)
 

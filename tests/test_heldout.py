@@ -19,10 +19,11 @@ from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.diagnosis.twins import twins
 from estimator.errors import EstimatorError
+from estimator.freerun import free_run
 from estimator.harm import Unseen, _Figure, harm, harm_of_parts
 from estimator.identify import _fitted, identify
 from estimator.model import JointModel, Transmission
-from estimator.model_monitor import measure_baseline
+from estimator.model_monitor import measure_baseline, seconds_of
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import MODELS
 
@@ -254,6 +255,28 @@ def test_a_constant_torque_of_a_rigid_joint_is_written_beside_what_is_found():
     assert [effect.name for effect in found.effects] == ["coulomb_friction"]
     (offset,) = (e for e in diagnosed_model(joint, found).motors[0].effects if e.name == "torque_offset")
     assert offset.parameters["torque_nm"] == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("gear", [1.0, 50.0])
+def test_gravity_of_a_rigid_joint_that_declares_none_is_named_and_written(gear):
+    """Once a turn, cogging looks like it where the motor has no gear."""
+    joint = jointfile.parse(
+        f'name = "axis"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\nviscous_damping_nm_s_rad = {kit.DAMPING}\n'
+        f'transmission = {{ model = "none" }}\ndrive = {{ node_id = 1, gear_ratio = {gear} }}\n'
+    )
+    theta, _, own = motion(8.0)
+    turned = np.interp(np.arange(len(theta)) + 0.5, np.arange(len(theta)), theta)
+    axis = joints.recorded(theta, own + 2.0 * np.sin(turned) - 1.0 * np.cos(turned), None)
+    found = diagnose(axis, joint.model(), BANDWIDTH_HZ)
+    (gravity,) = found.effects
+    assert gravity.name == "gravity" and set(gravity.alternatives) <= {"cogging"}
+    assert gravity.probability == 0.5 if gear == 1.0 else gravity.probability > 0.9
+    assert gravity.parameters == pytest.approx({"sin_nm": 2.0, "cos_nm": -1.0}, abs=0.01)
+    assert found.curves[0].fitted_nm == pytest.approx(found.curves[0].residual_nm, abs=0.05)
+    written = diagnosed_model(joint, found)
+    assert max(second.residual_nm[0] for second in seconds_of(axis, written)) < 0.02
+    assert free_run(axis, written).fit_percent["motor1_position"] > 98.0
+    assert diagnose(axis, written, BANDWIDTH_HZ).verdict == "sufficient"
 
 
 def test_a_constant_torque_of_the_motors_side_alone_is_written_as_the_zero_of_its_encoders():

@@ -82,11 +82,11 @@ class Candidate:
 def members(frame: Frame) -> list[Candidate]:
     """Effects that this joint can have and these data can reveal."""
     found = []
-    external = frame.linked
     for kind in LIBRARY.values():
         if kind.location == "link":
             smooth = "smoothing_rad_s" in kind.nonlinear
-            if external and (not smooth or reverses(frame.motors[0].link_velocity)):
+            shown = frame.linked or (frame.carried and kind.name == "gravity")  # all else is the motor's
+            if shown and (not smooth or reverses(frame.motors[0].link_velocity)):
                 found.append(Candidate(kind, None))
         elif kind.channel == "link_position":
             if any(frame.flexible) and (len(frame.motors) == 1 or kind.name != "deflection_delay"):

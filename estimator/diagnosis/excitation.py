@@ -39,6 +39,7 @@ _HINTS = {
             "only the link's dynamics ([link.dynamics]) or a known zero of the encoders separates them",
         ),
         ("cogging", "kinematic_error", "declare [link.dynamics]; a kinematic error shows on both sides"),
+        ("cogging", "gravity", "take the load off, or turn the axis upright: cogging stays"),
         (
             "viscous_damping", "encoder_delay",
             "move faster, so that the deflection changes with acceleration, or declare [link.dynamics]",

@@ -331,9 +331,9 @@ def curves_of(problem: Problem, after: Fitted) -> tuple[Curve, ...]:
         mine = [j for j, s in enumerate(after.slots) if s.kind == "term" and s.place == k]
         fitted = columns(frame, term.candidate, term.values, term.weights) @ np.array(term.weights)
         own = after.regression.design[: len(fitted), mine] @ after.posterior.x[mine]
-        equation = frame.equations - 1 if kind.location == "link" else motor or 0
-        pick = rows + equation * frame.rows
-        sign = -1.0 if kind.location == "motor" else 1.0
+        on_link = kind.location == "link" and not frame.carried
+        pick = rows + (frame.equations - 1 if on_link else motor or 0) * frame.rows
+        sign = 1.0 if on_link or kind.location not in ("motor", "link") else -1.0
         made.append(
             Curve(
                 name=kind.name,

@@ -311,7 +311,7 @@ class Frame:
     @property
     def carried(self) -> bool:
         """Whether the link moves with the first motor, which then has the dynamics of both."""
-        return self.model.link is not None and not self.flexible[0]
+        return not self.flexible[0]
 
     @property
     def pulls(self) -> tuple[bool, ...]:

@@ -39,7 +39,7 @@ def everyday(frame: Frame) -> list[Candidate]:
         made += [Candidate(LIBRARY["torque_constant"], i) for i in range(len(frame.motors))]
     for name in _AT_LINK:
         reading = name == "encoder_delay"
-        if (reading and any(frame.flexible)) or (not reading and (frame.linked or frame.carried)):
+        if any(frame.flexible) if reading else frame.model.link is not None:
             made.append(Candidate(LIBRARY[name], None))
     return made
 

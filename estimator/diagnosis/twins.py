@@ -39,6 +39,7 @@ _TABLE = (
     (("encoder_scale",), ("kinematic_error",), "turn", False),  # over a part of its period: a slope
     (("asymmetric_friction",), ("coulomb_friction", "torque_offset"), "", True),  # the sum
     (("backlash",), ("higher_order_stiffness",), "law", False),  # what bends otherwise looks like play
+    (("gravity",), ("cogging",), "gear", False),  # once a turn, of a rigid joint's motor without a gear
 )
 _CONSTANTS = ("torque_offset", "deflection_offset")
 
@@ -52,7 +53,9 @@ def twins(fitted: Fitted, problem: Problem) -> Iterator[Twin]:
         for i, motor in enumerate(problem.model.motors):
             spring = motor.transmission
             law = spring.model != "polynomial" or bool(spring.parameters)
-            if (told == "link" and linked) or (told == "law" and law) or (told == "turn" and turned):
+            geared = motor.flexible or (motor.gear_ratio or 1.0) != 1.0 or not turned
+            known = {"link": linked, "law": law, "turn": turned, "gear": geared}
+            if known.get(told, False):
                 continue
             for here, there in ((one, other), (other, one))[: 1 + both]:
                 held, instead = ({_key(name, i) for name in names} for names in (here, there))
@@ -62,7 +65,7 @@ def twins(fitted: Fitted, problem: Problem) -> Iterator[Twin]:
 
 
 def _key(name: str, motor: int) -> tuple[str, int | None]:
-    return name, None if LIBRARY[name].channel == "link_position" else motor
+    return name, None if LIBRARY[name].on_link else motor
 
 
 def _constants(fitted: Fitted, problem: Problem) -> Keys:

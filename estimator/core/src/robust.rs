@@ -16,6 +16,7 @@ use crate::effects::MotorEffects;
 use crate::error::Error;
 use crate::external::{External, LinkMomentum};
 use crate::laws::Law;
+use crate::library::Element;
 use crate::model::{Arrangement, Model, Transmission};
 use crate::noise::NoiseMeter;
 use crate::reasons::Why;
@@ -126,7 +127,8 @@ impl Robust {
                 Side::new(motor, effects, priors, &filters, period_s, looks as f64 * period_s, alarms)
             })
             .collect();
-        let alone = !model.has_deflection() && model.link.is_none();
+        let loaded = model.link.is_some() || model.link_effects.iter().any(Element::acts_on_link);
+        let alone = !model.has_deflection() && !loaded;
         let rigid = if alone { &motors[..] } else { &[] };
         let rigid = rigid.iter().map(|motor| RigidBalance::new(motor.inertia)).collect();
         Ok(Robust {

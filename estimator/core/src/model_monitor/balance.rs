@@ -31,20 +31,17 @@ impl ModelMonitor {
             raw[i] = own + x.motor[i] - torques[i] - x.transmission[i] - c.torque;
             raw[BALANCES + i] = c.torque;
         }
-        let Some(link) = self.link else { return raw };
-        let load = |position: f64, rate: f64, acceleration: f64| {
-            let gravity = link.gravity * (position + link.gravity_phase).sin();
-            link.inertia * acceleration + link.damping * rate + gravity
-        };
+        let load = self.link.map_or(0.0, |link| {
+            let gravity = link.gravity * (q + link.gravity_phase).sin();
+            link.inertia * link_acceleration + link.damping * link_rate + gravity
+        });
         if self.linked {
             // τ_k − (M q″ + D_q q′ + g(q) + τ_e + x_transmission + x_link) (eqs 4, 6)
             let through: f64 = (0..self.pulls).map(|i| torques[i] + x.transmission[i]).sum();
-            raw[motors] = external - load(q, link_rate, link_acceleration) - through - x.link;
+            raw[motors] = external - load - through - x.link;
             raw[BALANCES + motors] = through;
-        } else {
-            // Rigid: the link moves with the first motor.
-            let c = &each[0];
-            raw[0] += load(c.position, c.velocity, c.acceleration) + x.link - external;
+        } else if !self.flexible {
+            raw[0] += load + x.link - external;
         }
         raw
     }
@@ -80,9 +77,8 @@ impl ModelMonitor {
         let motors = self.motors.len();
         channels[..motors].copy_from_slice(&sample.motor_position[..motors]);
         channels[TORQUE..TORQUE + motors].copy_from_slice(&sample.motor_torque[..motors]);
-        if self.flexible {
-            channels[LINK] = sample.link_position;
-        }
+        // Rigid: the link moves with the first motor.
+        channels[LINK] = if self.flexible { sample.link_position } else { sample.motor_position[0] };
         if self.link.is_some() && sample.external_torque.is_finite() {
             channels[EXTERNAL] = sample.external_torque;
         }

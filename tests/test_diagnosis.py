@@ -257,6 +257,7 @@ def test_a_fault_of_installation_is_one_line(change, message, records):
 def test_the_simplest_within_one_standard_error_is_chosen(gain, best, chosen, monkeypatch):
     simple, other, third = (
         SimpleNamespace(
+            extra=None,
             name=name,
             keys=frozenset({(name, 0)}),
             scores=scores,

@@ -19,9 +19,12 @@ from drivelink.output.sentences import sentence
 from estimator import fit
 from estimator.choices import choice
 from estimator.diagnosis import Diagnosis, Errors, Finding, advice_for, diagnose
+from estimator.diagnosis.candidates import Candidate
 from estimator.diagnosis.curves import _bases
+from estimator.diagnosis.design_matrix import Term
 from estimator.diagnosis.findings import rivals_of
 from estimator.diagnosis.heldout import Held
+from estimator.diagnosis.law_parameters import Base
 from estimator.diagnosis.order import bends
 from estimator.diagnosis.probabilities import believed, chances, standing
 from estimator.diagnosis.problem import Problem
@@ -29,6 +32,7 @@ from estimator.diagnosis.result import Rival
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.twins import Twin
 from estimator.diagnosis.verdict import Judge, _Judged
+from estimator.effects import LIBRARY
 from estimator.identify import identify
 from estimator.model import JointModel, Motor, Transmission
 
@@ -230,16 +234,18 @@ def test_a_healthy_spring_that_is_bent_to_one_side_has_no_offset():
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "confirmed"),
+    ("before", "after", "confirmed", "curve"),
     [
-        ([1e-2] * 10, [2e-3] * 10, True),
-        ([1e-5] * 10, [9e-6] * 10, False),  # less than filters and rounding leave
-        ([1e-2, 1e-3] * 5, [1e-3, 9e-3] * 5, False),  # less than its scatter
-        ([1e-3] * 10, [8e-4] * 10, False),  # less than a law leaves, for one with more parameters
+        ([1e-2] * 10, [2e-3] * 10, True, False),
+        ([1e-5] * 10, [9e-6] * 10, False, False),  # less than filters and rounding leave
+        ([1e-2, 1e-3] * 5, [1e-3, 9e-3] * 5, False, False),  # less than its scatter
+        ([1e-3] * 10, [8e-4] * 10, False, False),  # less than a law leaves, for one with more parameters
+        ([1e-2] * 10, [2e-3] * 10, True, True),
+        ([1e-3] * 10, [8e-4] * 10, False, True),  # less than a law leaves, of which a curve may be
     ],
 )
 def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
-    before, after, confirmed, monkeypatch
+    before, after, confirmed, curve, monkeypatch
 ):
     monkeypatch.setattr(Held, "squared", lambda _, one: float(np.mean(one.squares)))
     monkeypatch.setattr(Held, "scores", lambda _, one, among: -0.5 * np.log(one.squares))
@@ -248,10 +254,36 @@ def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
     held.problem, law = SimpleNamespace(floor=choice("floor")), SimpleNamespace(floor=0.02)
     held._laws, like = {}, {"terms": (), "families": frozenset(), "bends": set(), "regression": law}
     rest, found = (
-        SimpleNamespace(squares=np.array(x), parameters=count, **like)
-        for count, x in enumerate((before, after))
+        SimpleNamespace(squares=np.array(x), parameters=count * (not curve), extra=extra, **like)
+        for count, (x, extra) in enumerate(((before, None), (after, "a curve" if curve else None)))
     )
     assert held.confirms(found, rest) is confirmed
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_number_is_no_effect_within_the_deviation_that_the_joint_file_knows(known):
+    (record,), model = kit.World([{}]).run(), kit.model()
+    (motor,), link = model.motors, model.link
+    assert link is not None
+    motor, link = (
+        replace(one, viscous_damping_nm_s_rad=1.15 * one.viscous_damping_nm_s_rad) for one in (motor, link)
+    )
+    if known:
+        motor = replace(motor, viscous_damping_std_nm_s_rad=0.15 * motor.viscous_damping_nm_s_rad)
+        link = replace(link, viscous_damping_std_nm_s_rad=0.15 * link.viscous_damping_nm_s_rad)
+    verdict = diagnose(record, replace(model, motors=(motor,), link=link)).verdict
+    assert verdict == ("sufficient" if known else "effect")
+
+
+def test_a_zero_of_the_encoders_is_within_what_they_read_beside_a_spring_of_no_stiffness():
+    (record,) = kit.World([{}], seconds=5.0).run()
+    (motor,) = kit.model(linked=False).motors
+    own = replace(motor, transmission=Transmission(model="exponential"))
+    problem = Problem([record], replace(kit.model(), motors=(own,)), 15.0)
+    null = problem.null()
+    zero = Term(Candidate(LIBRARY["deflection_offset"], 0), {})
+    soft = Base((np.array([7e-15, 0.15]),))
+    assert np.isfinite(problem.fit((zero,), soft, null.corrections).posterior.evidence)
 
 
 @pytest.mark.parametrize("speed", [0.0, 2.0])

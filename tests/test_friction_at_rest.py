@@ -64,6 +64,21 @@ def test_a_smoothing_that_is_declared_stays():
     assert found.smoothing_rad_s is None
 
 
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("smoothing_rad_s", [0.002, 0.004])
+def test_what_declared_friction_may_hold_at_rest_is_no_missing_effect(seed, smoothing_rad_s):
+    """A smoothing of another recording's fit: the rests of this one lacked "Stribeck friction", certain."""
+    (motor,) = JOINT.model().motors
+    (friction,) = motor.effects
+    told = replace(friction, parameters={**friction.parameters, "smoothing_rad_s": smoothing_rad_s})
+    model = replace(JOINT.model(), motors=(replace(motor, effects=(told,)),))
+    found = diagnose(moves(seed), model)
+    assert (found.verdict, found.effects) == ("sufficient", ())
+    assert found.validation.before_relative > 0.05  # what is left is said
+    torque = moves(seed).motor_torque_nm + 0.2 * np.sin(3.0 * moves(seed).motor_position_rad)
+    assert diagnose(replace(moves(seed), motor_torque_nm=torque), model).verdict != "sufficient"
+
+
 def test_rests_add_no_ripple_of_which_the_motor_passes_no_period():
     """Each rest has a torque and a place of its own: of hundreds of fast ripples some meet them all."""
 

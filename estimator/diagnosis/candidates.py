@@ -22,7 +22,9 @@ __all__ = [
     "members",
     "reach_of",
     "reverses",
+    "rubbing",
     "sign_smoothing",
+    "slips",
     "spread_of",
 ]
 
@@ -142,7 +144,7 @@ def columns(
         weights: its linear ones, as far as they are known: the reaction depends on them too.
     """
     kind = candidate.kind
-    lasting = kind.location == "motor" and not _slips(kind) and _OF_MOTOR.issuperset(kind.coordinates)
+    lasting = kind.location == "motor" and not slips(kind) and _OF_MOTOR.issuperset(kind.coordinates)
     memo = frame.signals.memo if lasting else frame.memo
     key = (candidate.key, *values.values(), *(weights if _bilinear(kind) else ()))
     made = memo.get(key)
@@ -158,13 +160,13 @@ def _bilinear(kind: EffectType) -> bool:
     return kind.name == "kinematic_error"
 
 
-def _slips(kind: EffectType) -> bool:
-    """Whether an effect is dry friction of a motor, a law of the direction it moves in."""
+def slips(kind: EffectType) -> bool:
+    """Return whether an effect is dry friction of a motor, a law of the direction it moves in."""
     return kind.location == "motor" and "smoothing_rad_s" in kind.nonlinear
 
 
-def _rubbing(frame: Frame, motor: int) -> Coordinates:
-    """A motor's coordinates as dry friction has them.
+def rubbing(frame: Frame, motor: int) -> Coordinates:
+    """Return a motor's coordinates as dry friction has them.
 
     Dry friction holds a motor at rest with what all else leaves of the balance, up to its level (a set-valued
     law: Acary and Brogliato, Numerical Methods for Nonsmooth Dynamical Systems, 2008). No reading tells this
@@ -181,7 +183,7 @@ def _rubbing(frame: Frame, motor: int) -> Coordinates:
 def _columns(frame: Frame, candidate: Candidate, values: Values, weights: tuple[float, ...]) -> FloatArray:
     """The columns (k, rows) of an effect."""
     kind, motor = candidate.kind, candidate.motor or 0
-    terms = kind.terms(_rubbing(frame, motor) if _slips(kind) else frame.motors[motor], values)
+    terms = kind.terms(rubbing(frame, motor) if slips(kind) else frame.motors[motor], values)
     if kind.channel == "link_position":
         return _reading(frame, terms)
     if kind.channel == "deflection" and candidate.motor is None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.diagnosis.candidates import Candidate, columns
+from estimator.choices import choice
+from estimator.diagnosis.candidates import Candidate, columns, rubbing, slips
 from estimator.diagnosis.corrections import READINGS
 from estimator.diagnosis.frame import Corrections, Frame
 from estimator.effects import LIBRARY, elements
 from estimator.model import Effect, JointModel
 from estimator.sample import FloatArray
 
-__all__ = ["declared_corrections", "declared_laws", "declared_torque"]
+__all__ = ["declared_corrections", "declared_laws", "declared_torque", "held_at_rest"]
 
 
 def declared_corrections(model: JointModel) -> Corrections:
@@ -48,6 +49,31 @@ def declared_torque(frame: Frame, *, laws: bool = False) -> FloatArray:
             weights = tuple(values[name] for name in candidate.kind.linear)
             total = total + columns(frame, candidate, values, weights) @ np.array(weights)
     return total
+
+
+def held_at_rest(frame: Frame, left: FloatArray) -> FloatArray:
+    """Return what declared dry friction may hold of the balances' residual (rows,).
+
+    A motor at rest has any friction up to its level, of which a law of the velocity names one.
+    """
+    if ("held",) not in frame.memo:
+        band = np.zeros((2, frame.rows * frame.equations))
+        for candidate, effect in _declared(frame.model):
+            motor, kind = candidate.motor or 0, candidate.kind
+            if not slips(kind):
+                continue
+            c, here = frame.motors[motor], rubbing(frame, motor)
+            still = np.abs(c.velocity) <= choice("sure") * frame.signals.velocity_noise(motor)
+            for values in elements(effect)[1]:
+                weights = np.array([values[name] for name in kind.linear])
+                fast = choice("sure") * values["smoothing_rad_s"]
+                ends = (c._replace(velocity=np.full_like(c.velocity, v)) for v in (fast, -fast))
+                now = weights @ kind.terms(here, values)
+                more = np.array([now - weights @ kind.terms(end, values) for end in ends])
+                band += frame.column(motor, np.where(still, more, 0.0), None)
+        frame.memo["held",] = band
+    least, most = frame.memo["held",]
+    return np.clip(left, least, most)
 
 
 def declared_laws(model: JointModel) -> dict[object, int]:

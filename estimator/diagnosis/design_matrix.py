@@ -185,7 +185,7 @@ class Stack:
         made = [_of_run(parts, p, None) for p in range(parts[0].shape[1])]
         sizes = np.array([_rms_of(column) for column in made])
         width = PRIORS["effect"].std * self._torque_rms / np.sqrt(len(made)) / sizes
-        for p, std in enumerate(effect_std(self._model, candidate, width).tolist()):
+        for p, std in enumerate(effect_std(self._frames, candidate, width).tolist()):
             slot = Slot("term", candidate.kind.name, candidate.motor, None, k, p, float(taken[p]))
             self._add(made[p], slot, std, low=least(self._model, candidate))
         if term.weights:

@@ -13,7 +13,8 @@ from scipy.special import softmax
 
 from estimator.choices import choice, whole
 from estimator.diagnosis.candidates import members
-from estimator.diagnosis.declared import declared_laws
+from estimator.diagnosis.declared import declared_laws, held_at_rest
+from estimator.diagnosis.frame import Corrections
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.problem import Problem, stretches
 from estimator.diagnosis.result import Errors
@@ -30,15 +31,17 @@ class Residual(NamedTuple):
         left_nm: (n,) residual.
         torque_nm: (n,) measured torque without its mean.
         motors: (n,) whether a row belongs to a motor's balance.
+        held_nm: (n,) what dry friction may hold of the residual at rest, by which no model is judged.
     """
 
     left_nm: FloatArray
     torque_nm: FloatArray
     motors: NDArray[np.bool_]
+    held_nm: FloatArray
 
     def of(self, rows: NDArray[np.bool_]) -> Residual:
         """Return that of some rows."""
-        return Residual(self.left_nm[rows], self.torque_nm[rows], self.motors[rows])
+        return Residual(self.left_nm[rows], self.torque_nm[rows], self.motors[rows], self.held_nm[rows])
 
     @property
     def rms_nm(self) -> float:
@@ -52,8 +55,8 @@ class Residual(NamedTuple):
 
     @property
     def square(self) -> float:
-        """Mean square of all balances."""
-        return float(np.mean(self.left_nm**2))
+        """Mean square of all balances, as models are judged."""
+        return float(np.mean((self.left_nm - self.held_nm) ** 2))
 
     @property
     def torque_square(self) -> float:
@@ -97,7 +100,7 @@ class Held:
         every = range(len(problem.records))
         for k in every if len(every) > 1 else ():
             left = _own_removed(fitted, left, k)
-        every_row = _residual(problem, fitted, left)
+        every_row = _residual(problem, fitted, left, fitted.corrections)
         return [every_row.of(recording == k) for k in every]
 
     def residuals(self, fitted: Fitted) -> list[Residual]:
@@ -129,7 +132,7 @@ class Held:
 
     def _by_stretch(self, one: Residual) -> FloatArray:
         """(stretches, balances) mean squared error, relative to the recording's torque."""
-        square = (one.left_nm**2).reshape(self.problem.equations, -1) / one.torque_square
+        square = ((one.left_nm - one.held_nm) ** 2).reshape(self.problem.equations, -1) / one.torque_square
         parts = np.array_split(square, whole("groups"), axis=1)
         return np.array([np.mean(part, axis=1) for part in parts])
 
@@ -139,14 +142,15 @@ class Held:
         `of`: the same data under another declared model, which the other one is of.
 
         The mean score of the blocks rises by more than its standard error, and the error falls by more than
-        filters and rounding leave anyway; by more than a law leaves, for a law of the same phenomenon with
-        more parameters.
+        filters and rounding leave anyway; by more than laws leave, for a law of the same phenomenon with
+        more parameters, and for a free curve, which is of any.
         """
         return self.margin(found, rest, of) > 1.0
 
     def margin(self, found: Fitted, rest: Fitted, of: Held | None = None) -> float:
         """Return how many times more than `confirms` asks for one model gains over another."""
-        floor = rest.regression.floor if self._refines(found, rest) else self.problem.floor
+        own = found.extra is None and not self._refines(found, rest)
+        floor = self.problem.floor if own else rest.regression.floor
         if found.bends - rest.bends:  # a declared spring is a law, as declared effects are
             floor = np.hypot(floor, self.problem.bent(rest))
         theirs, both = of or self, (found, rest)
@@ -293,7 +297,8 @@ def held_out(problem: Problem, validation: Record | None = None) -> Held:
 
 def residual_of(problem: Problem, fitted: Fitted, rows: NDArray[np.bool_]) -> Residual:
     """Return the residual of some rows under a model fitted to that problem."""
-    return _residual(problem, fitted, fitted.regression.residual(fitted.posterior.x)).of(rows)
+    left = fitted.regression.residual(fitted.posterior.x)
+    return _residual(problem, fitted, left, fitted.corrections).of(rows)
 
 
 def errors_of(problem: Problem, before: Fitted, after: Fitted, rows: NDArray[np.bool_]) -> Errors:
@@ -323,7 +328,7 @@ def _on_other(other: Problem, fitted: Fitted) -> Residual:
     )
     there = other.transferred(fitted, corrections)
     left = there.regression.residual(there.posterior.x)
-    return _residual(other, fitted, _own_removed(there, left, 0))
+    return _residual(other, fitted, _own_removed(there, left, 0), (corrections,))
 
 
 def _own_removed(fitted: Fitted, left: FloatArray, run: int) -> FloatArray:
@@ -339,18 +344,22 @@ def _own_removed(fitted: Fitted, left: FloatArray, run: int) -> FloatArray:
     return left - free @ np.linalg.lstsq(free, left, rcond=1e-9)[0]
 
 
-def _residual(problem: Problem, fitted: Fitted, left: FloatArray) -> Residual:
+def _residual(
+    problem: Problem, fitted: Fitted, left: FloatArray, corrections: Sequence[Corrections]
+) -> Residual:
     """Residual of all rows; relative to the declared torque if the torque's scale has been fitted."""
-    left = left.copy()
-    equation = problem.group % problem.equations
+    frames = problem.at(corrections, fitted.base)
+    ends = np.cumsum([frame.rows * frame.equations for frame in frames])[:-1]
+    pairs = zip(frames, np.split(left, ends), strict=True)
+    held = np.concatenate([held_at_rest(frame, part) for frame, part in pairs])
+    size, equation = np.ones(len(left)), problem.group % problem.equations
     for scale in fitted.regression.scales:
-        left[equation == scale.groups[0] % problem.equations] /= scale.size(fitted.posterior.x)
-    return Residual(left, problem.torque(), equation < len(problem.model.motors))
+        size[equation == scale.groups[0] % problem.equations] = scale.size(fitted.posterior.x)
+    return Residual(left / size, problem.torque(), equation < len(problem.model.motors), held / size)
 
 
 def _joined(parts: Sequence[Residual]) -> Residual:
-    left, torque, motors = zip(*parts, strict=True)
-    return Residual(np.concatenate(left), np.concatenate(torque), np.concatenate(motors))
+    return Residual(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def _errors(before: Residual, after: Residual) -> Errors:

@@ -80,12 +80,18 @@ def _of_run_std(frames: Sequence[Frame], candidate: Candidate, torque_rms: float
         return (choice("floor") if linked and not calibrating else std) * torque_rms
     phi = frames[0].motors[motor].deflection
     if calibrating:  # a healthy joint's encoders may start anywhere
-        return std * float(np.ptp(phi) + abs(np.mean(phi)))
+        return std * _extent(frames[:1], motor)
     if not linked:
         return std * float(np.ptp(phi))
     # What is left of a zero that has been set is no effect, nor is what rounding leaves: half a count.
     rounded = 0.5 * max(f.signals.resolution_rad[motor] for f in frames)
     return max(choice("floor") * float(np.std(phi)), rounded)
+
+
+def _extent(frames: Sequence[Frame], motor: int) -> float:
+    """Largest deflection that may be read, rad."""
+    each = [frame.motors[motor].deflection for frame in frames]
+    return max(float(np.ptp(phi) + abs(np.mean(phi))) for phi in each)
 
 
 def _of_motor_std(
@@ -103,7 +109,8 @@ def _of_motor_std(
     if calibrating and undeclared:  # a damping that nobody declared is not known to be zero
         return PRIORS["effect"].std * torque_rms / max(fast, 1e-300)
     floor = 0.0 if linked else PRIORS["viscous_damping_floor"].std * torque_rms / max(fast, 1e-300)
-    return float(np.hypot(std * motor.viscous_damping_nm_s_rad, floor))
+    known = 0.0 if calibrating else motor.viscous_damping_std_nm_s_rad or 0.0
+    return max(float(np.hypot(std * motor.viscous_damping_nm_s_rad, floor)), known)
 
 
 def _of_link_std(
@@ -115,7 +122,8 @@ def _of_link_std(
         return (0.0,)
     share, place = _declared_std(frame, name, calibrating), _OF_LINK.index(name)
     value = (link.inertia_kg_m2, link.viscous_damping_nm_s_rad, abs(link.gravity_nm))[place]
-    std = max(share * value, link.std[place] if calibrating else 0.0)
+    known = (link.inertia_std_kg_m2, link.viscous_damping_std_nm_s_rad, link.gravity_std_nm)[place]
+    std = max(share * value, link.std[place] if calibrating else known or 0.0)
     if name != "gravity":
         return (std,)
     unknown = PRIORS["effect"].std * torque_rms if calibrating and frame.carried else 0.0
@@ -129,11 +137,11 @@ def _declared_std(frame: Frame, name: str, calibrating: bool) -> float:
     return PRIORS["calibrated_torque" if name == "torque_constant" else "declared"].std
 
 
-def effect_std(model: JointModel, candidate: Candidate, by_torque: FloatArray) -> FloatArray:
+def effect_std(frames: Sequence[Frame], candidate: Candidate, by_torque: FloatArray) -> FloatArray:
     """Return the prior standard deviations of an effect's linear parameters, by torque or by
     reading error.
     """
-    name = candidate.kind.name
+    name, model = candidate.kind.name, frames[0].model
     if name == "motor_inertia":
         return np.full_like(
             by_torque, PRIORS["anchor"].std * model.motors[candidate.motor or 0].inertia_kg_m2
@@ -148,6 +156,8 @@ def effect_std(model: JointModel, candidate: Candidate, by_torque: FloatArray) -
         return np.full_like(by_torque, PRIORS["late_deflection"].std)
     if name in ("torque_delay", "torque_lag", "encoder_delay"):
         return np.minimum(PRIORS["late"].std, by_torque)
+    if name == "deflection_offset":  # of a spring without stiffness no torque tells it
+        return np.minimum(_extent(frames, candidate.motor or 0), by_torque)
     if name in ("encoder_scale", "encoder_eccentricity"):
         return np.minimum(PRIORS[name].std, by_torque)
     return by_torque

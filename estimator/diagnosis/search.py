@@ -151,7 +151,7 @@ class Search:
         grams = [mine @ mine.swapaxes(1, 2) for mine in np.split(stacked, ends, axis=-1)]
         sizes = np.sqrt(np.mean(stacked * stacked, axis=-1)) + 1e-100
         by_torque = PRIORS["effect"].std * problem.torque_rms / np.sqrt(count) / sizes
-        std = effect_std(problem.model, candidate, by_torque)
+        std = effect_std(frames, candidate, by_torque)
         first = sum(map(len, made))
         made.append(stacked.reshape(points * count, -1))
         rows = slice(first, first + points * count)

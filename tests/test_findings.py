@@ -34,7 +34,7 @@ from estimator.diagnosis.twins import Twin
 from estimator.diagnosis.verdict import Judge, _Judged
 from estimator.effects import LIBRARY
 from estimator.identify import identify
-from estimator.model import JointModel, Motor, Transmission
+from estimator.model import Effect, JointModel, Motor, Transmission
 
 
 def finding(name: str, probability: float, **more: Any) -> Finding:
@@ -273,6 +273,18 @@ def test_a_number_is_no_effect_within_the_deviation_that_the_joint_file_knows(kn
         link = replace(link, viscous_damping_std_nm_s_rad=0.15 * link.viscous_damping_nm_s_rad)
     verdict = diagnose(record, replace(model, motors=(motor,), link=link)).verdict
     assert verdict == ("sufficient" if known else "effect")
+
+
+@pytest.mark.parametrize(("std_nm", "verdict"), [(0.04, "sufficient"), (None, "effect")])
+@pytest.mark.parametrize("more_nm", [0.06, -0.06])
+def test_an_effect_that_was_fitted_may_be_off_by_its_deviation(std_nm, verdict, more_nm):
+    (record,), model = kit.World([{"coulomb_nm": 0.5 + more_nm}]).run(), kit.model()
+    (motor,) = model.motors
+    std = {} if std_nm is None else {"torque_nm": std_nm}
+    level = {"torque_nm": 0.5, "smoothing_rad_s": 0.002}
+    friction = Effect(name="coulomb_friction", parameters=level, std=std)
+    found = diagnose(record, replace(model, motors=(replace(motor, effects=(friction,)),)))
+    assert found.verdict == verdict
 
 
 def test_a_zero_of_the_encoders_is_within_what_they_read_beside_a_spring_of_no_stiffness():

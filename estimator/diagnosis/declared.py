@@ -12,7 +12,7 @@ from estimator.effects import LIBRARY, elements
 from estimator.model import Effect, JointModel
 from estimator.sample import FloatArray
 
-__all__ = ["declared_corrections", "declared_laws", "declared_torque", "held_at_rest"]
+__all__ = ["declared_corrections", "declared_laws", "declared_torque", "held_at_rest", "known_effects"]
 
 
 def declared_corrections(model: JointModel) -> Corrections:
@@ -74,6 +74,17 @@ def held_at_rest(frame: Frame, left: FloatArray) -> FloatArray:
         frame.memo["held",] = band
     least, most = frame.memo["held",]
     return np.clip(left, least, most)
+
+
+def known_effects(model: JointModel) -> dict[Candidate, tuple[dict[str, float], tuple[float, ...]]]:
+    """Return parameters of torques that the joint file says were fitted, and the linear ones' deviations."""
+    made = {}
+    for candidate, effect in _declared(model):
+        values, linear = elements(effect)[1], candidate.kind.linear
+        if candidate.kind.channel == "torque" and len(values) == 1 and effect.std:
+            std = [float(np.max(effect.std.get(name, 0.0))) for name in linear]
+            made[candidate] = values[0], tuple(max(one, choice("exact") * max(std)) for one in std)
+    return made
 
 
 def declared_laws(model: JointModel) -> dict[object, int]:

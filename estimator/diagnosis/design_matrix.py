@@ -11,6 +11,7 @@ import numpy as np
 from estimator.choices import choice
 from estimator.diagnosis.candidates import Candidate, bounds_of, columns, reach_of, sign_smoothing, spread_of
 from estimator.diagnosis.corrections import read
+from estimator.diagnosis.declared import known_effects
 from estimator.diagnosis.frame import Corrections, Frame
 from estimator.diagnosis.joint_priors import OF_RUN, effect_std, everyday, everyday_std, least
 from estimator.diagnosis.law_parameters import Base
@@ -157,15 +158,20 @@ class Stack:
 
     def everyday(self, without: set[tuple[str, int | None]], pinned: Pinned) -> None:
         """Add the everyday errors that are not terms."""
+        known = known_effects(self._model)
         for candidate in everyday(self._frames[0]):
-            widths = everyday_std(self._frames, candidate, self._torque_rms, self._calibrating)
+            values, std = known.get(candidate, ({}, None))
+            widths = everyday_std(self._frames, candidate, self._torque_rms, self._calibrating, std)
             if candidate.key in without or not any(widths):
                 continue
             name, motor = candidate.key
             held = pinned.get(candidate.key)
-            values = {}
-            if candidate.kind.nonlinear:
-                values["smoothing_rad_s"] = sign_smoothing(self._frames, motor or 0)
+            positive = any(one.positive for one in candidate.kind.parameters if one.linear)
+            lows = [least(self._model, candidate)] * len(widths)
+            if values and positive:
+                lows = [-values[one] for one in candidate.kind.linear]
+            if candidate.kind.nonlinear and not values:
+                values = {"smoothing_rad_s": sign_smoothing(self._frames, motor or 0)}
             parts = [columns(f, candidate, values) for f in self._frames]
             for run in range(len(self._frames)) if name in OF_RUN else (None,):
                 taken = self._taken(candidate, run or 0)
@@ -173,7 +179,7 @@ class Stack:
                     slot = Slot("everyday", name, motor, run, p, p, float(taken[p]))
                     column = _of_run(parts, p, run)
                     if held is None:
-                        self._add(column, slot, width, low=least(self._model, candidate))
+                        self._add(column, slot, width, low=lows[p])
                     else:
                         self._add(column, slot, choice("exact") * width, centre=held[p])
 

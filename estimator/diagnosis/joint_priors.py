@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from estimator.choices import choice
 from estimator.diagnosis.candidates import Candidate, reverses
+from estimator.diagnosis.declared import known_effects
 from estimator.diagnosis.frame import Frame
 from estimator.effects import LIBRARY
 from estimator.model import JointModel
@@ -41,11 +43,15 @@ def everyday(frame: Frame) -> list[Candidate]:
         reading = name == "encoder_delay"
         if any(frame.flexible) if reading else frame.model.link is not None:
             made.append(Candidate(LIBRARY[name], None))
-    return made
+    return made + [one for one in known_effects(frame.model) if one not in made]
 
 
 def everyday_std(
-    frames: Sequence[Frame], candidate: Candidate, torque_rms: float, calibrating: bool
+    frames: Sequence[Frame],
+    candidate: Candidate,
+    torque_rms: float,
+    calibrating: bool,
+    known: tuple[float, ...] | None = None,
 ) -> tuple[float, ...]:
     """Return the prior standard deviation of each linear parameter of an everyday error; 0:
     it does not apply.
@@ -55,14 +61,18 @@ def everyday_std(
         candidate: the error.
         torque_rms: of the motor torque without its mean, N·m.
         calibrating: the recordings are of a healthy joint and determine its declared numbers.
+        known: the deviations of a declared effect (`known_effects`).
     """
-    if candidate.kind.name in OF_RUN:
-        return (_of_run_std(frames, candidate, torque_rms, calibrating),)
-    if candidate.kind.name in ("torque_delay", "encoder_delay"):
-        return (PRIORS[candidate.kind.name].std * frames[0].signals.period_s,)
-    if candidate.kind.name in _AT_LINK:
-        return _of_link_std(frames[0], candidate, torque_rms, calibrating)
-    return (_of_motor_std(frames, candidate, torque_rms, calibrating),)
+    own, name = (0.0,) * len(candidate.kind.linear), candidate.kind.name
+    if name in OF_RUN:
+        own = (_of_run_std(frames, candidate, torque_rms, calibrating),)
+    elif name in ("torque_delay", "encoder_delay"):
+        own = (PRIORS[name].std * frames[0].signals.period_s,)
+    elif name in _AT_LINK:
+        own = _of_link_std(frames[0], candidate, torque_rms, calibrating)
+    elif name in (*_AT_MOTOR, "torque_constant"):
+        own = (_of_motor_std(frames, candidate, torque_rms, calibrating),)
+    return own if calibrating or known is None else tuple(map(math.hypot, own, known))
 
 
 def _of_run_std(frames: Sequence[Frame], candidate: Candidate, torque_rms: float, calibrating: bool) -> float:
@@ -119,7 +129,7 @@ def _of_link_std(
     """Of inertia, damping and gravity of the link."""
     name, link = candidate.kind.name, frame.model.link
     if link is None:
-        return (0.0,)
+        return (0.0,) * len(candidate.kind.linear)
     share, place = _declared_std(frame, name, calibrating), _OF_LINK.index(name)
     value = (link.inertia_kg_m2, link.viscous_damping_nm_s_rad, abs(link.gravity_nm))[place]
     known = (link.inertia_std_kg_m2, link.viscous_damping_std_nm_s_rad, link.gravity_std_nm)[place]

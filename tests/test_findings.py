@@ -29,7 +29,7 @@ from estimator.diagnosis.order import bends
 from estimator.diagnosis.probabilities import believed, chances, standing
 from estimator.diagnosis.problem import Problem
 from estimator.diagnosis.result import Rival
-from estimator.diagnosis.search import Search
+from estimator.diagnosis.search import Search, _Tried
 from estimator.diagnosis.twins import Twin
 from estimator.diagnosis.verdict import Judge, _Judged
 from estimator.effects import LIBRARY
@@ -234,30 +234,44 @@ def test_a_healthy_spring_that_is_bent_to_one_side_has_no_offset():
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "confirmed", "curve"),
+    ("before", "after", "confirmed", "of"),
     [
-        ([1e-2] * 10, [2e-3] * 10, True, False),
-        ([1e-5] * 10, [9e-6] * 10, False, False),  # less than filters and rounding leave
-        ([1e-2, 1e-3] * 5, [1e-3, 9e-3] * 5, False, False),  # less than its scatter
-        ([1e-3] * 10, [8e-4] * 10, False, False),  # less than a law leaves, for one with more parameters
-        ([1e-2] * 10, [2e-3] * 10, True, True),
-        ([1e-3] * 10, [8e-4] * 10, False, True),  # less than a law leaves, of which a curve may be
+        ([1e-2] * 10, [2e-3] * 10, True, ""),
+        ([1e-5] * 10, [9e-6] * 10, False, ""),  # less than filters and rounding leave
+        ([1e-2, 1e-3] * 5, [1e-3, 9e-3] * 5, False, ""),  # less than its scatter
+        ([1e-3] * 10, [8e-4] * 10, False, ""),  # less than a law leaves, for one with more parameters
+        ([1e-2] * 10, [2e-3] * 10, True, "curve"),
+        ([1e-3] * 10, [8e-4] * 10, False, "curve"),  # less than a law leaves, of which a curve may be
+        ([1e-3] * 10, [8e-4] * 10, False, "declared"),  # the same, for one more of a declared phenomenon
+        ([1e-3] * 10, [8e-4] * 10, True, "another"),
     ],
 )
 def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
-    before, after, confirmed, curve, monkeypatch
+    before, after, confirmed, of, monkeypatch
 ):
     monkeypatch.setattr(Held, "squared", lambda _, one: float(np.mean(one.squares)))
     monkeypatch.setattr(Held, "scores", lambda _, one, among: -0.5 * np.log(one.squares))
     monkeypatch.setattr(Held, "_relative", lambda _, floor: np.square(floor))
     held: Any = Held.__new__(Held)
     held.problem, law = SimpleNamespace(floor=choice("floor")), SimpleNamespace(floor=0.02)
-    held._laws, like = {}, {"terms": (), "families": frozenset(), "bends": set(), "regression": law}
+    held._laws, like = {"declared": 2}, {"bends": set(), "regression": law}
+    two = SimpleNamespace(parameters=(1, 2))
     rest, found = (
-        SimpleNamespace(squares=np.array(x), parameters=count * (not curve), extra=extra, **like)
-        for count, (x, extra) in enumerate(((before, None), (after, "a curve" if curve else None)))
-    )
+        SimpleNamespace(
+            squares=np.array(x), parameters=k, extra="a curve" if k and of == "curve" else None,
+            families=frozenset(own), **like,
+            terms=[SimpleNamespace(candidate=SimpleNamespace(family=one, kind=two)) for one in own],
+        )
+        for k, (x, own) in enumerate(((before, ()), (after, [of] if of else ())))
+    )  # fmt: skip
     assert held.confirms(found, rest) is confirmed
+
+
+def test_what_an_effect_adds_to_a_covariance_is_symmetric():
+    shift, steep = np.array([[1e6, 3.0, 0.7], [-0.3, 2e5, 11.0]]), np.array([1.0, 0.7])
+    precision = np.eye(2) + 1e12 * np.outer(steep, steep)
+    added = _Tried(Candidate(LIBRARY["backlash"], 0), {}, 1, 1.0, shift, precision, steep).covariance
+    assert np.array_equal(added, added.T) and np.any(added)
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -78,7 +78,8 @@ class _Tried(NamedTuple):
         """(k, k) increase of the covariance of x."""
         if not math.isfinite(self.gain):
             return np.zeros((self.shift.shape[1],) * 2)
-        return np.asarray(self.shift.T @ np.linalg.solve(self.precision, self.shift))
+        made = self.shift.T @ np.linalg.solve(self.precision, self.shift)
+        return np.asarray(0.5 * (made + made.T))
 
     @property
     def change(self) -> FloatArray:

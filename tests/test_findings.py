@@ -267,6 +267,21 @@ def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
     assert held.confirms(found, rest) is confirmed
 
 
+def test_a_law_moves_as_far_as_its_shape_may_and_no_parameter_alone():
+    """Beside a shape that stopped half way a stiffness went all the way: a VSA-II ended at 10 MN·m/rad."""
+    (record,) = kit.World([{}], seconds=5.0).run()
+    (motor,) = kit.model(linked=False).motors
+    own = replace(motor, transmission=Transmission(model="vsa-ii"))
+    frame = Problem([record], replace(kit.model(), motors=(own,)), 15.0).frames[0]
+    for step, moved in (
+        ([10.0, 0.1], [110.0, 1.6]),
+        ([10.0, 1.5], [105.0, 2.25]),
+        ([10.0, -1.0], [105.0, 1.0]),
+    ):
+        (alpha,) = Base((np.array([100.0, 1.5]),)).moved(frame, np.array(step)).alpha
+        assert alpha == pytest.approx(moved, rel=2e-4)
+
+
 def test_what_an_effect_adds_to_a_covariance_is_symmetric():
     shift, steep = np.array([[1e6, 3.0, 0.7], [-0.3, 2e5, 11.0]]), np.array([1.0, 0.7])
     precision = np.eye(2) + 1e12 * np.outer(steep, steep)

@@ -68,18 +68,17 @@ class Base:
         return np.asarray(frame.column(0, more, more) - frame.column(1, 2.0 * np.asarray(energy), None))
 
     def moved(self, frame: Frame, step: FloatArray) -> Base:
-        """Return alpha plus a step, with shape parameters limited to their bounds."""
+        """Return alpha plus a step, so much of it that the shape stays within its bounds and a half."""
         alpha, begin = [], 0
         for model, old in zip(self.models(frame), self.alpha, strict=True):
-            new = old + step[begin : begin + len(old)]
+            mine, share = step[begin : begin + len(old)], 1.0
             begin += len(old)
-            if model is not None and model.shape_bounds:
-                first = len(new) - len(model.shape_bounds)
-                for k, (low, high) in enumerate(model.shape_bounds):
-                    reach = 0.5 * abs(old[first + k])
-                    value = float(np.clip(new[first + k], old[first + k] - reach, old[first + k] + reach))
-                    new[first + k] = np.clip(value, low * 1.0001 + 1e-9, high * 0.9999)
-            alpha.append(new)
+            bounds = () if model is None else model.shape_bounds
+            for at, by, (low, high) in zip(old[::-1], mine[::-1], bounds[::-1], strict=False):
+                least, most = max(low * 1.0001 + 1e-9, 0.5 * at), min(high * 0.9999, 1.5 * at)
+                if at + by != np.clip(at + by, least, most):
+                    share = min(share, max(((least if by < 0.0 else most) - at) / by, 0.0))
+            alpha.append(old + share * mine)
         return replace(self, alpha=tuple(alpha))
 
     def parameters(self, frame: Frame) -> list[dict[str, ParameterValue]]:

@@ -146,7 +146,7 @@ def test_a_link_encoder_that_is_eccentric_is_named_and_the_stiffness_of_a_stiff_
     assert np.max(off) < 0.05
 
 
-@pytest.mark.parametrize(("off_rad", "names"), [(0.003, []), (0.01, ["deflection_offset"])])
+@pytest.mark.parametrize(("off_rad", "names"), [(0.001, []), (0.01, ["deflection_offset"])])
 def test_a_zero_that_is_elsewhere_from_the_start_is_found_where_the_spring_shows_it(off_rad, names):
     truth, record, joint = read(150.0, 8000.0)
     moved = replace(record, link_position_rad=record.link_position_rad + off_rad)

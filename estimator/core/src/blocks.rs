@@ -200,7 +200,8 @@ impl Blocks {
         (self.moved, self.located, self.placed) = (false, true, true);
         self.end_doubt();
         self.unform();
-        (self.noise.variance, self.own, self.torque, self.quick) = (f64::NAN, f64::NAN, f64::NAN, 0.0);
+        (self.noise.variance, self.own, self.quick) = (f64::NAN, f64::NAN, 0.0);
+        self.torque = self.motor.fit_rms.map_or(f64::NAN, |(_, usual)| usual);
         self.unexplained = if self.posterior.is_some() { 0.0 } else { f64::NAN };
     }
 

@@ -141,27 +141,25 @@ impl DeflectionFilter {
     }
 
     /// φ now, and its variance, rad²: foreseen from the moment of the torque, and corrected by the latest reading, whose
-    /// noise is R.
+    /// noise is R; before anything is known of the motion, as noisy as that.
     ///
     /// What is foreseen has the variance that P grows to by the random third derivative.
     #[must_use]
-    pub fn now(&self, present: &Present) -> (f64, f64) {
+    pub fn now(&self, present: &Present, noise: f64) -> (f64, f64) {
         let (read, now) = (present.behind_s, present.behind_s + present.ahead_s);
-        let [by_then, by_now] = [self.grown(read), self.grown(now)];
-        let share = if read > 0.0 { self.p.map_or(1.0, |_| by_then / (by_then + self.noise)) } else { 0.0 };
+        let [by_then, by_now] = [read, now].map(|t| self.p.map(|p| self.grown(&p, t)));
+        let share = by_then.map_or(1.0, |by_then| by_then / (by_then + noise));
+        let share = if read > 0.0 { share } else { 0.0 };
         let phi = self.at(now) + share * (present.phi - self.at(read));
-        (phi, (by_now - share * by_then).max(0.0))
+        (phi, by_now.zip(by_then).map_or(noise, |(now, then)| (now - share * then).max(0.0)))
     }
 
     /// Variance of φ, so long after the moment of the torque, as the filter's own innovations bear it out, rad².
-    fn grown(&self, t: f64) -> f64 {
+    fn grown(&self, p: &Covariance, t: f64) -> f64 {
         let slope = [1.0, t, 0.5 * t * t];
-        let all = self.p.map_or(0.0, |p| {
-            let pairs = (0..3).flat_map(|i| (0..3).map(move |j| (i, j)));
-            pairs.map(|(i, j)| slope[i] * p[2 + i][2 + j] * slope[j]).sum::<f64>()
-                + self.wander * t.powi(5) / 20.0
-        });
-        self.motion.missed.max(1.0) * all
+        let pairs = (0..3).flat_map(|i| (0..3).map(move |j| (i, j)));
+        let all = pairs.map(|(i, j)| slope[i] * p[2 + i][2 + j] * slope[j]).sum::<f64>();
+        self.motion.missed.max(1.0) * (all + self.wander * t.powi(5) / 20.0)
     }
 
     /// φ′ at the last sample, rad/s.

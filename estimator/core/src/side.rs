@@ -62,6 +62,7 @@ pub struct Side {
     pub blocks: Blocks,
     effects: MotorEffects,
     theta: f64,         // of the last sample
+    noise: [f64; 2],    // variances of θ's and q's, rad²
     declared: Declared, // what they do at this moment
     excitation: Excitation,
     /// Whether the motion reveals the stiffness.
@@ -112,6 +113,7 @@ impl Side {
             blocks,
             effects,
             theta: 0.0,
+            noise: [0.0; 2],
             declared: Declared::default(),
             excitation: Excitation::default(),
             excited: false,
@@ -236,7 +238,7 @@ impl Side {
             self.blocks.grow(&factors, &self.balance);
             self.judge();
         }
-        self.theta = theta;
+        (self.theta, self.noise) = (theta, noise);
         self.balance.read(filters, theta, torque);
         self.feed_effects(phi, link, time);
         self.balance.feed(filters, phi, link, &self.declared);

@@ -75,7 +75,7 @@ fn what_is_foreseen_is_as_uncertain_as_it_is_wrong() {
             });
         }
         if k > 3000 {
-            let (ahead, variance) = filter.now(&Present { phi: 0.0, behind_s: 0.0, ahead_s });
+            let (ahead, variance) = filter.now(&Present { phi: 0.0, behind_s: 0.0, ahead_s }, 2.0 * noise);
             square += (ahead - phi(now + ahead_s)).powi(2);
             foreseen += variance;
         }

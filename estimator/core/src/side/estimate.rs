@@ -20,7 +20,8 @@ impl Side {
         if self.rigid {
             return TransmissionEstimate { flexibility_torque: left(), ..nothing };
         }
-        let (read, of_read) = self.deflection.now(present);
+        let (read, of_read) = self.deflection.now(present, self.noise.iter().sum());
+        let of_read = of_read + self.balance.rounding(self.noise, 0.0); // an error that stays is in every reading
         let phi = read + self.effects.kinematic_error(self.theta - self.effects.offset);
         let Some(at) = self.blocks.at(phi, self.deflection.link_rate(), &self.balance) else {
             return TransmissionEstimate { flexibility_torque: left(), deflection: read, ..nothing };

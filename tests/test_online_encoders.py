@@ -259,11 +259,10 @@ def moves_with_rests(seconds, seed):
     return np.hstack(parts)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
-def test_a_stiff_joint_that_rests_between_moves_keeps_its_stiffness(seed):
-    """Deflections of 2 to 15 counts: at rest rounding is an error that stays, and no effect of the joint."""
-    stiffness, inertia, damping, link, gravity = 250.0, 0.05, 0.13, 0.05, 1.2  # known in closed form
-    q, rate, second, third, fourth = moves_with_rests(12.0, seed)
+def stiff_joint(stiffness, counts, size, seconds, seed):
+    """A fitted joint in closed form, what it reads as it moves within 0.3 `size` rad, and its spring's torque, N·m."""
+    inertia, damping, link, gravity = 0.05, 0.13, 0.05, 1.2
+    q, rate, second, third, fourth = size * moves_with_rests(seconds, seed)
     torque = link * second + gravity * np.sin(q)
     torque_rate = link * third + gravity * np.cos(q) * rate
     torque_second = link * fourth + gravity * (np.cos(q) * second - np.sin(q) * rate**2)
@@ -273,23 +272,36 @@ def test_a_stiff_joint_that_rests_between_moves_keeps_its_stiffness(seed):
     held = 0.5 * (motor + np.append(motor[1:], motor[-1])) + 0.004 * np.random.default_rng(seed).normal(
         size=len(q)
     )
-    count = 2.0 * math.pi / 2**16
+    count = 2.0 * math.pi / counts
     theta, link_read = (np.round(at / count) * count for at in (q + torque / stiffness, q))
-    samples = (Sample(k, (theta[k],), (math.nan,), (held[k],), link_read[k]) for k in range(len(q)))
-    known = {
-        "parameters": {"coefficients_nm_rad": (stiffness,)},
-        "covariance": ((1230.0,),),
-    }  # as fitted, 14 %
+    samples = [Sample(k, (theta[k],), (math.nan,), (held[k],), link_read[k]) for k in range(len(q))]
+    variance = (0.14 * stiffness) ** 2
+    known = {"parameters": {"coefficients_nm_rad": (stiffness,)}, "covariance": ((variance,),)}
     fitted = Motor(
         inertia_kg_m2=inertia,
         viscous_damping_nm_s_rad=damping,
         transmission=Transmission(model="polynomial", order=1, **known),
         inertia_std_relative=0.15,
+        fit_rms_nm=(0.01, float(np.sqrt(np.mean(motor**2)))),
     )
-    found, estimator = kit.play(JointModel(arrangement="single", motors=(fitted,)), samples)
+    return JointModel(arrangement="single", motors=(fitted,)), samples, -torque
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_stiff_joint_that_rests_between_moves_keeps_its_stiffness(seed):
+    """Deflections of 2 to 15 counts: at rest rounding is an error that stays, and no effect of the joint."""
+    joint, samples, torque = stiff_joint(250.0, 2**16, 1.0, 12.0, seed)
+    found, estimator = kit.play(joint, samples)
     valid = found.valid[SETTLED:]
     assert np.mean(valid) > 0.5  # it rests a third of the time
     # 1 %: a tenth of what the inertia leaves open; the stated deviation of its end is below 0.3 %.
-    assert np.max(np.abs(found.stiffness_nm_rad[SETTLED:][valid] / stiffness - 1.0)) < 0.01
-    assert not np.any(kit.wrong_torque(found, -torque))
+    assert np.max(np.abs(found.stiffness_nm_rad[SETTLED:][valid] / 250.0 - 1.0)) < 0.01
+    assert not np.any(kit.wrong_torque(found, torque))
     assert estimator.undeclared() == [[]]
+
+
+def test_a_torque_of_less_than_a_count_is_not_valid_before_it_is_learned():
+    """A fitted file knows how large the torque is; what is read of a deflection of half a count is its rounding."""
+    joint, samples, torque = stiff_joint(800.0, 2**13, 0.5, 6.0, 1)
+    found, _ = kit.play(joint, samples)
+    assert not np.any(kit.wrong_torque(found, torque))

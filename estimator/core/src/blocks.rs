@@ -44,7 +44,7 @@ pub struct Readings {
     pub white: f64,
     /// Covariance of the filtered φ and θ″ that it makes, rad², rad²/s², rad²/s⁴.
     pub noise: [[f64; 2]; 2],
-    /// Variance that rounding adds to the row at hand where the positions hardly move, (N·m)².
+    /// What rounding adds to the variance of φ in the row at hand where the positions hardly move, over that of white noise.
     pub rounding: f64,
     /// Half the resolution of the deflection, rad: a reading that cuts off instead of rounding moves its zero by as much.
     pub resolution: f64,

@@ -320,7 +320,7 @@ impl Side {
         self.blocks.readings = Readings {
             white: in_columns + gains[0] * torque_noise,
             noise: [[deflection, both], [both, acceleration]],
-            rounding: self.stiffness.powi(2) * rounding,
+            rounding: if rounding > 0.0 { rounding / deflection } else { 0.0 },
             resolution: (3.0 * positions).sqrt(),
         };
         let row = self.balance.row();

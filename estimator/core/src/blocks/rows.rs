@@ -47,12 +47,12 @@ impl Blocks {
     /// believed of it before rows have shown it; rounding at rest is an error that does not change.
     fn weight(&self, row: &Row, resting: [f64; 2]) -> f64 {
         let [share, declared] = resting;
-        let Some(known) = self.posterior.as_ref().filter(|_| self.is_reference()) else {
-            return (1.0 + (share * self.priors.coulomb_friction / EARLY).powi(2)).recip();
-        };
-        let of_load = LOAD.zip(balance::SPRING).map(|(found, spring)| known.x[found] * row[spring].abs());
-        let open = share * (known.x[DRY] + of_load.sum::<f64>()) + declared;
-        (1.0 + (open * open + self.readings.rounding) / self.noise.variance).recip()
+        let known = self.posterior.as_ref().filter(|_| self.is_reference());
+        let open = known.map_or(share * self.priors.coulomb_friction / EARLY, |known| {
+            let of_load = LOAD.zip(balance::SPRING).map(|(found, spring)| known.x[found] * row[spring].abs());
+            (share * (known.x[DRY] + of_load.sum::<f64>()) + declared) / self.noise.variance.sqrt()
+        });
+        (1.0 + open * open + self.readings.rounding).recip()
     }
 
     /// Whether the latest rows are neither noise, nor as large as what explained blocks have held, nor uncertain.

@@ -49,7 +49,8 @@ fn a_steep_spring_behind_a_coarse_encoder_is_followed_better_than_it_is_read() {
         }
     }
     assert!(square < tuning.motor_noise / 9.0, "{} of {}", square.sqrt(), tuning.motor_noise.sqrt());
-    assert!((0.5..2.0).contains(&(square / filter.grown(0.0))), "{square} of {}", filter.grown(0.0));
+    let foreseen = filter.now(&Present { phi: 0.0, behind_s: 0.0, ahead_s: 0.0 }, 0.0).1;
+    assert!((0.5..2.0).contains(&(square / foreseen)), "{square} of {foreseen}");
 }
 
 #[test]
@@ -62,8 +63,8 @@ fn what_is_foreseen_is_as_uncertain_as_it_is_wrong() {
     for k in 1..9000 {
         let now = f64::from(k) * t;
         filter.update(0.0, (phi(now) / count).round() * count, 0.0, 0.0);
+        let noise = count * count / 12.0;
         if k % 30 == 0 {
-            let noise = count * count / 12.0;
             filter.tune(&Tuning {
                 jerk: jerk(now) / HIDDEN.sqrt(),
                 motor_noise: 0.1 * noise,
@@ -75,7 +76,7 @@ fn what_is_foreseen_is_as_uncertain_as_it_is_wrong() {
             });
         }
         if k > 3000 {
-            let (ahead, variance) = filter.now(&Present { phi: 0.0, behind_s: 0.0, ahead_s }, 2.0 * noise);
+            let (ahead, variance) = filter.now(&Present { phi: 0.0, behind_s: 0.0, ahead_s }, 1.1 * noise);
             square += (ahead - phi(now + ahead_s)).powi(2);
             foreseen += variance;
         }
@@ -109,4 +110,13 @@ fn dampings_that_cancel_each_other_make_no_filter_unstable() {
     }
     assert!(worst < 1e-4, "{worst}");
     assert_eq!(filter.unsettled, 0);
+}
+
+#[test]
+fn a_deflection_is_as_uncertain_as_its_reading_before_motion_is_known() {
+    let mut filter = DeflectionFilter::new(0.1, 0.5, 60.0, 1e-3, 0.03);
+    filter.restart(0.0, 0.1);
+    let present = |behind_s| Present { phi: 0.2, behind_s, ahead_s: 0.0 };
+    assert_eq!(filter.now(&present(0.0), 1e-8), (0.1, 1e-8));
+    assert_eq!(filter.now(&present(2e-3), 1e-8), (0.2, 1e-8));
 }

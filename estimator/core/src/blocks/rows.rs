@@ -52,7 +52,8 @@ impl Blocks {
             let of_load = LOAD.zip(balance::SPRING).map(|(found, spring)| known.x[found] * row[spring].abs());
             (share * (known.x[DRY] + of_load.sum::<f64>()) + declared) / self.noise.variance.sqrt()
         });
-        (1.0 + open * open + self.readings.rounding).recip()
+        let rounding = known.map_or(0.0, |_| self.readings.rounding);
+        (1.0 + open * open + rounding).recip()
     }
 
     /// Whether the latest rows are neither noise, nor as large as what explained blocks have held, nor uncertain.

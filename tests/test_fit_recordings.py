@@ -73,8 +73,8 @@ def test_each_recording_is_validated_by_the_others(runs):
     found = identify([*runs, kit.World([{"late_s": LATE_S}], seed=9).run()[0]], model)
     for one in found.recordings:
         assert one.validation is not None
-        # The others determine the machine as well as all do: nothing is fitted to noise.
-        assert one.validation.relative == pytest.approx(one.train.relative, rel=0.1)
+        # The others determine the machine as well as all do: nothing is fitted to noise. Filters leave 3e-4 of a torque.
+        assert one.validation.relative == pytest.approx(one.train.relative, rel=0.1, abs=1e-4)
     stranger = kit.World([{"late_s": LATE_S, "inertia_kg_m2": 0.5 * kit.INERTIA}], seed=9).run()[0]
     *_, last = identify([*runs, stranger], model).recordings
     assert last.validation is not None

@@ -58,8 +58,8 @@ class Reloader:
         self._move, self._build = move, build
         self._publish = publish
         self._events = events
-        self._seen: tuple[int, ...] | None = ()
-        self._requested = False
+        self._seen = self._signature()
+        self._requested = not self._is_as(known)  # edited since it was read
         self._text = known  # fingerprint of what is read
         self._standing = ""  # what holds of a file that is not, or not wholly, in use
         self._restart = ""  # what of the file that is read requires a restart
@@ -122,6 +122,12 @@ class Reloader:
         except OSError:
             return None
         return status.st_ctime_ns, status.st_size, status.st_ino  # ctime: no program can set it
+
+    def _is_as(self, known: str) -> bool:
+        try:
+            return fingerprint(read_text(self.path)) == known
+        except DrivelinkError:
+            return False
 
     def _prepare(self, asked: bool) -> None:
         """Read the file, and make its estimator if its text is another one than that in use, or if asked."""

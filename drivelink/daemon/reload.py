@@ -124,6 +124,7 @@ class Reloader:
         return status.st_ctime_ns, status.st_size, status.st_ino  # ctime: no program can set it
 
     def _is_as(self, known: str) -> bool:
+        """Whether the file has this text; one that cannot be read has another."""
         try:
             return fingerprint(read_text(self.path)) == known
         except DrivelinkError:

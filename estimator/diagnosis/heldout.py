@@ -158,9 +158,7 @@ class Held:
         return min(fall, _in_errors(self.scores(found, both) - theirs.scores(rest, both)))
 
     def _refines(self, one: Fitted, other: Fitted) -> bool:
-        """Whether a model has laws of the same phenomena with more parameters, beside a declared one with as
-        many.
-        """
+        """Whether a model has laws of the same phenomena with more parameters; of a declared one, as many."""
         kinds = [t.candidate for t in one.terms]
         declared = {c.family for c in kinds if len(c.kind.parameters) >= self._laws.get(c.family, math.inf)}
         return one.families <= other.families | declared and one.parameters > other.parameters

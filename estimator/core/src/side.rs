@@ -307,7 +307,7 @@ impl Side {
 
     /// The row of this moment; what has been found to be shifted.
     ///
-    /// `noise`: variances of θ and q; `torque_noise`: of τ; `gains`: of the filters for white noise
+    /// `noise`: variances of θ and q; `torque_noise`: of τ; `gains`: of the filters for white noise.
     pub fn learn(&mut self, noise: [f64; 2], torque_noise: f64, gains: &[f64; 3]) -> Option<Shift> {
         self.held_s = 0.0;
         self.unconfirmed_s -= self.period;

@@ -33,6 +33,25 @@ fn main() -> ExitCode {
     ExitCode::FAILURE
 }
 
+/// One line of an estimate, with two digits of the uncertainty and the value as far.
+fn print(estimate: &Estimate, missing: u64) -> io::Result<()> {
+    let now_ns = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as i128;
+    let places = (1.0 - estimate.stiffness_std_nm_rad.log10().floor()).clamp(0.0, 9.0) as usize;
+    writeln!(
+        io::stdout(),
+        "{} {:.3} N·m, {:.places$} ± {:.places$} N·m/rad, valid {}, observable {}, usable {}, {} µs after its SYNC, {} missing",
+        estimate.sequence,
+        estimate.flexibility_torque_nm,
+        estimate.stiffness_nm_rad,
+        estimate.stiffness_std_nm_rad,
+        estimate.valid(),
+        estimate.observable(),
+        estimate.usable(),
+        (now_ns - i128::from(estimate.stamp_ns)) / 1000,
+        missing
+    )
+}
+
 fn run() -> Result<(), String> {
     let mut arguments = std::env::args().skip(1);
     let joint = arguments.next().unwrap_or("elbow".into());
@@ -64,23 +83,7 @@ fn run() -> Result<(), String> {
         let Ok(estimate) = decoded else { continue };
         missing += last.map_or(0, |last| estimate.sequence.saturating_sub(last + 1));
         last = Some(estimate.sequence);
-        let now_ns = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as i128;
-        // Two digits of the uncertainty, and the value as far.
-        let places = (1.0 - estimate.stiffness_std_nm_rad.log10().floor()).clamp(0.0, 9.0) as usize;
-        let written = writeln!(
-            io::stdout(),
-            "{} {:.3} N·m, {:.places$} ± {:.places$} N·m/rad, valid {}, observable {}, usable {}, {} µs after its SYNC, {} missing",
-            estimate.sequence,
-            estimate.flexibility_torque_nm,
-            estimate.stiffness_nm_rad,
-            estimate.stiffness_std_nm_rad,
-            estimate.valid(),
-            estimate.observable(),
-            estimate.usable(),
-            (now_ns - i128::from(estimate.stamp_ns)) / 1000,
-            missing
-        );
-        match written {
+        match print(&estimate, missing) {
             Err(error) if error.kind() == io::ErrorKind::BrokenPipe => break, // `| head`
             Err(error) => return Err(format!("standard output: {error}")),
             Ok(()) => (),

@@ -160,7 +160,7 @@ fn rounding_is_an_error_that_stays_where_a_position_does() {
     let step = |t: f64| t * t * (3.0 - 2.0 * t);
     let moves = |t: f64| 500.0 * (t.floor() + step((2.0 * t.fract()).min(1.0)));
     let (rest, moves) = (ratio(&|_| 0.0), ratio(&moves));
-    assert!((rest - 1.0).abs() < 0.05 && (moves - 1.0).abs() < 0.1, "{rest} {moves}");
+    assert!((rest - 1.0).abs() < 0.01 && (moves - 1.0).abs() < 0.05, "{rest} {moves}");
     // A wave of a few counts a second is taken for rest in part; a fast one is white, but for its beats with the sampling.
     for (size, w) in
         [(0.3, 6.0), (3.0, 6.0), (30.0, 6.0), (100.0, 6.0), (1000.0, 6.0), (10.0, 30.0), (100.0, 30.0)]

@@ -257,7 +257,7 @@ fn noise_of_columns_pulls_what_multiplies_them() {
     let reduced = frame.reduce_noisy(&gram, &gram.noise(&[(1, 3, 1.0, 0), (2, 3, 1.0, 1)], &covariance));
     let prior = Prior::independent([0.0; UNKNOWNS], &[1e3; UNKNOWNS]);
     let found = solve(&reduced, 0b110, &prior, 1.0).unwrap();
-    // By the true unknowns it is exact, but for what n rows leave of noise, some 0.01.
+    // By the true unknowns it is exact, but for what n rows leave of noise: 0.01, five times.
     let mut truth = [0.0; UNKNOWNS];
     truth[..3].copy_from_slice(&x);
     let pull = reduced.pull(&truth, 0b110);

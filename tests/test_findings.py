@@ -35,6 +35,7 @@ from estimator.diagnosis.verdict import Judge, _Judged
 from estimator.effects import LIBRARY
 from estimator.identify import identify
 from estimator.model import Effect, JointModel, Motor, Transmission
+from estimator.transmissions import MODELS
 
 
 def finding(name: str, probability: float, **more: Any) -> Finding:
@@ -267,19 +268,21 @@ def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
     assert held.confirms(found, rest) is confirmed
 
 
-def test_a_law_moves_as_far_as_its_shape_may_and_no_parameter_alone():
+def test_a_law_moves_half_of_the_way_to_a_bound_of_its_shape_and_its_torque_as_far():
     """Beside a shape that stopped half way a stiffness went all the way: a VSA-II ended at 10 MN·m/rad."""
     (record,) = kit.World([{}], seconds=5.0).run()
     (motor,) = kit.model(linked=False).motors
-    own = replace(motor, transmission=Transmission(model="vsa-ii"))
-    frame = Problem([record], replace(kit.model(), motors=(own,)), 15.0).frames[0]
-    for step, moved in (
-        ([10.0, 0.1], [110.0, 1.6]),
-        ([10.0, 1.5], [105.0, 2.25]),
-        ([10.0, -1.0], [105.0, 1.0]),
-    ):
-        (alpha,) = Base((np.array([100.0, 1.5]),)).moved(frame, np.array(step)).alpha
-        assert alpha == pytest.approx(moved, rel=2e-4)
+    own, law = replace(motor, transmission=Transmission(model="vsa-ii")), MODELS["vsa-ii"]
+    frame, begin = (
+        Problem([record], replace(kit.model(), motors=(own,)), 15.0).frames[0],
+        np.array([100.0, 1.5]),
+    )
+    phi = np.sqrt(np.mean(frame.motors[0].deflection ** 2, keepdims=True))
+    for step, share in (([10.0, 0.1], 1.0), ([10.0, 1.5], 0.5), ([10.0, -1.0], 0.25)):
+        (alpha,) = Base((begin,)).moved(frame, np.array(step)).alpha
+        assert alpha[1] == pytest.approx(1.5 + share * step[1])
+        torque = law.torque(phi, begin) + law.jacobian(phi, begin) @ (share * np.array(step))
+        assert law.torque(phi, alpha) == pytest.approx(torque)
 
 
 def test_what_an_effect_adds_to_a_covariance_is_symmetric():

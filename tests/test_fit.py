@@ -16,6 +16,10 @@ from drivelink.output import plots
 from drivelink.output.fitreport import fit_plot
 from estimator import EstimatorError, JointModel, LinkDynamics, Motor, Status, Transmission, fit
 from estimator.diagnosis import diagnose
+from estimator.diagnosis.candidates import Candidate
+from estimator.diagnosis.design_matrix import Term
+from estimator.diagnosis.problem import Problem
+from estimator.effects import LIBRARY
 from estimator.gate import judge
 from estimator.identify import identify
 from estimator.transmissions import MODELS
@@ -171,12 +175,65 @@ def test_what_is_left_shows_friction_as_a_step_and_hysteresis_as_a_loop(tmp_path
     assert plots.save(fit_plot([looping], joint), tmp_path / "fit.png").stat().st_size > 20_000
 
 
-def test_of_a_joint_that_a_hand_guides_no_stiffness_is_stated():
-    """Noise in the columns takes a quarter off all parameters: the torque that damps tells nothing of their scale."""
+def test_the_intervals_of_a_joint_that_a_hand_guides_hold_what_noise_takes_off_and_no_more():
+    """Noise in the columns takes a sixth off all parameters; the intervals have just that, in closed form."""
     _, record = joints.guided(*joints.polynomial(np.array([[[150.0, 1500.0]]])), 12000)
     (found,) = fit(record, joints.joint_model(0.12, 0.8))
-    assert not found.excited and not found.parameters
-    assert abs(found.alpha[0] - 150.0) < 2.0 * np.sqrt(found.covariance[0, 0])
+    pairs = (
+        (found.alpha[0], 150.0, np.sqrt(found.covariance[0, 0])),
+        (found.inertia_kg_m2, 0.12, found.nuisance_std["inertia"]),
+        (found.viscous_damping_nm_s_rad, 0.8, found.nuisance_std["damping"]),
+    )
+    for value, truth, std in pairs:
+        assert 0.1 * truth < truth - value < 1.2 * std < 1.5 * (truth - value)
+
+
+@pytest.mark.parametrize("late", [0, 5])
+def test_a_stiff_spring_is_found_also_where_the_link_is_read_ten_deflections_late(late):
+    """Its rate is most of the deflection then: from no stiffness at all a fit ended at a thirtieth of it."""
+    plants = joints.Plants(*joints.polynomial(np.array([[[3000.0]]])), 0.12, 0.8, 0.45, 0.3, 3.0)
+    truth = joints.simulate(plants, joints.sweep(np.random.default_rng(0), 9000, 1, 1, T, 2.5, 3.0), T)
+    record = _record(truth, 0, motor_counts=131072, link_bits=18, link_delay=late)
+    (found,) = fit(record, joints.joint_model(0.12, 0.8, order=1))
+    std = np.sqrt(found.covariance[0, 0])
+    assert abs(found.alpha[0] - 3000.0) < 1.96 * std < 0.03 * 3000.0  # noise of 0.04 N·m
+    assert found.link_delay_s == pytest.approx(late * T, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "c, zero_rad, size_nm", [(1.6, -0.1, 0.6), (1.6, 0.1, 0.3), (1.6, 0.05, 0.15), (1.75, 0.15, 0.3)]
+)
+def test_a_vsa_ii_is_found_from_nothing_wherever_its_encoders_start(c, zero_rad, size_nm):
+    """A prior about zero drew its shape to a bound, where any stiffness has the same torque."""
+    law, alpha = MODELS["vsa-ii"], np.array([8.0, c])
+    torque, stiffness = (
+        lambda phi, of=of: of(phi.ravel(), alpha).reshape(phi.shape) for of in (law.torque, law.stiffness)
+    )
+    plants = joints.Plants(torque, stiffness, 0.05, 0.1, 0.1, 0.02, 0.5)
+    truth = joints.simulate(plants, joints.sweep(np.random.default_rng(1), 8000, 1, 1, T, size_nm, 3.0), T)
+    noise = np.random.default_rng(5).normal(0, 0.01, truth.tau[:, 0].shape)
+    record = _record(truth, 0, motor_counts=131072, torque_noise=noise)
+    record = replace(record, link_position_rad=record.link_position_rad + zero_rad)
+    (found,) = fit(record, joints.joint_model(0.05, 0.1, model="vsa-ii"))
+    phi = truth.q[2000::7, 0] - truth.theta[2000::7, 0, 0]
+    assert found.deflection_offset_rad == pytest.approx(zero_rad, abs=5e-4)
+    assert np.sqrt(np.mean((law.stiffness(phi, found.alpha) / law.stiffness(phi, alpha) - 1) ** 2)) < 0.01
+    assert found.excited
+
+
+def test_no_step_of_a_fit_leads_where_a_spring_carries_powers_of_ten():
+    """Half a second late an exponential spring has exp(60) times its torque: normal equations were singular there."""
+    k, b = 150.0, 200.0
+    plants = joints.Plants(
+        lambda phi: np.sign(phi) * k / b * np.expm1(b * np.abs(phi)),
+        lambda phi: k * np.exp(b * np.abs(phi)),
+        *(0.1, 0.5, 0.45, 0.3, 5.0),
+    )
+    truth = joints.simulate(plants, joints.sweep(np.random.default_rng(1), 6000, 1, 1, T, 20.0, 3.0), T)
+    problem = Problem([_record(truth, 0)], joints.joint_model(0.1, 0.5, model="exponential"), 15.0)
+    late = Term(Candidate(LIBRARY["deflection_delay"], None), {})
+    found = problem.added(problem.null(), late, 3, begin=0.5)
+    assert found.posterior.sigma[0] < problem.torque_rms
 
 
 def test_the_spring_of_a_serial_joint_bears_on_the_motor_that_sets_its_lever():

@@ -24,7 +24,6 @@ from estimator.sample import SIGMA_95, FloatArray
 __all__ = ["design_effects", "hac_covariance"]
 
 
-_TIMES = ("torque_delay", "encoder_delay", "deflection_offset")  # of channels: they multiply nothing
 _FULL = 1e-9  # leverage is below one by the priors; guards a division against rounding
 
 Labels = NDArray[np.int64]
@@ -50,32 +49,37 @@ def hac_covariance(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> Fl
 
 
 def _attenuated(problem: Problem, fitted: Fitted, motor: int) -> FloatArray:
-    """(k, k) what noise in the positions takes off all that multiplies them, squared.
+    """(k, k) what noise in a motor's deflection, velocity and acceleration moves the parameters by, squared.
 
-    Errors in variables (Fuller, Measurement Error Models, 1987): its power over what tells of the scale of a
-    motor's parameters, by that of its inertia. It is nothing where the motor drives the motion.
+    Errors in variables (Fuller, Measurement Error Models, 1987): the covariance of each column's noise with
+    that of the row is taken for signal. It is nothing where the motor drives the motion.
     """
-    slots, nothing = fitted.slots, np.zeros_like(fitted.posterior.covariance)
-    own = [(s.kind, s.name, s.motor) for s in slots]
-    if ("everyday", "motor_inertia", motor) not in own:
-        return nothing
-    at, declared = own.index(("everyday", "motor_inertia", motor)), problem.model.motors[motor]
-    scale = np.array([s.taken for s in slots]) + fitted.posterior.x
-    scale[[s.motor != motor or s.kind == "shape" or s.name in _TIMES for s in slots]] = 0.0
-    scale[at] += declared.inertia_kg_m2
-    if ("everyday", "viscous_damping", motor) in own:
-        scale[own.index(("everyday", "viscous_damping", motor))] += declared.viscous_damping_nm_s_rad
-    law = fitted.base.models(problem.frames[0])[motor]
-    if law is not None and law.linear is not None:
-        scale[[s.kind == "base" and s.place >= law.linear for s in slots]] = 0.0
-    told = 0.0
+    posterior, law = fitted.posterior, fitted.base.models(problem.frames[0])[motor]
+    declared, numbers = problem.model.motors[motor], {"motor_inertia": 0.0, "viscous_damping": 0.0}
+    for slot, x in zip(fitted.slots, posterior.x, strict=True):
+        if slot.name in numbers and slot.motor == motor:
+            numbers[slot.name] += slot.taken + float(x)
+    inertia = declared.inertia_kg_m2 + numbers["motor_inertia"]
+    damping = declared.viscous_damping_nm_s_rad + numbers["viscous_damping"]
+    taken = np.zeros(len(posterior.x))
     for run, frame in enumerate(problem.at(fitted.corrections, fitted.base)):
-        group = run * problem.equations + motor
-        noise = frame.signals.row_noise(motor, float(scale[at]), frame.motors[motor].stiffness)
+        group, c = run * problem.equations + motor, frame.motors[motor]
+        velocity, acceleration, deflection = frame.signals.position_noise(motor)
+        shaken = {"motor_inertia": inertia * acceleration, "viscous_damping": damping * velocity}
+        bends = np.zeros(0)
+        if law is not None:
+            slopes = law.stiffness_jacobian(c.deflection, fitted.base.alpha[motor])
+            shaken["motor_inertia"] -= float(np.mean(c.stiffness)) * velocity
+            bends = slopes.T @ c.stiffness * (deflection / len(slopes))
+            bends -= np.mean(slopes, axis=0) * inertia * velocity
         rows = np.count_nonzero(problem.group == group)
-        told += rows * noise / float(fitted.times[group] * fitted.posterior.sigma[group] ** 2)
-    share = min(told * float(fitted.posterior.covariance[at, at]) / max(float(scale[at] ** 2), 1e-300), 1.0)
-    return share**2 * np.outer(scale, scale)
+        weight = rows / (fitted.times[group] * posterior.sigma[group] ** 2)
+        for j, slot in enumerate(fitted.slots):
+            if slot.motor == motor and slot.kind != "shape":
+                own = bends[slot.place] if slot.kind == "base" else shaken.get(slot.name, 0.0)
+                taken[j] += float(weight * own)
+    moved = posterior.covariance @ taken
+    return np.outer(moved, moved)
 
 
 def design_effects(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> FloatArray:

@@ -125,15 +125,19 @@ class Stack:
         self.low.append(low - slot.taken)
 
     def transmissions(self, base: Base) -> None:
-        """Add transmission parameters; the first of each, the stiffness, is not negative."""
+        """Add transmission parameters; the first of each, the stiffness, is not negative.
+
+        A shape is as probable anywhere within its bounds; the other coefficients are about zero.
+        """
         design = np.concatenate([base.design(f) for f in self._frames])
         wide = PRIORS["transmission"].std * self._torque_rms
         j = 0
-        for i, alpha in enumerate(base.alpha):
-            for p, value in enumerate(alpha):
-                slot = Slot("base", "", i, None, p, 0, float(value))
-                low = 0.0 if p == 0 else -np.inf
-                self._add(design[:, j], slot, wide / _rms_of(design[:, j]), low=low)
+        for i, (alpha, law) in enumerate(zip(base.alpha, base.models(self._frames[0]), strict=True)):
+            shapes = len(law.shape_names) if law is not None else 0
+            for p, value in enumerate(alpha.tolist()):
+                slot = Slot("base", "", i, None, p, 0, value)
+                centre, low = value * (p >= len(alpha) - shapes), 0.0 if p == 0 else -np.inf
+                self._add(design[:, j], slot, wide / _rms_of(design[:, j]), centre, low)
                 j += 1
 
     def lever(self, base: Base) -> None:

@@ -206,18 +206,26 @@ class Signals:
         response = 2.0 * np.pi * frequency * light_response(self)
         return float(np.sqrt(self.noise(self.theta[motor], response)))
 
-    def row_noise(self, motor: int | None, inertia: float, stiffness: FloatArray) -> float:
-        """Return the variance of a row of a motor's balance, or the link's (None), by its positions' noise,
-        (N·m)².
+    def position_noise(self, motor: int) -> tuple[float, float, float]:
+        """Return the variances of a motor's velocity, acceleration and deflection by the positions' noise
+        within the bandwidth, in rad and s.
         """
-        moved = self.q if motor is None and self.q is not None else self.theta[motor or 0]
+        read = 0.0 if self.q is None else self._within(self.q, 0)
+        position, velocity, acceleration = (self._within(self.theta[motor], order) for order in range(3))
+        return velocity, acceleration, position + read
+
+    def row_noise(self, link: LinkDynamics, stiffness: FloatArray) -> float:
+        """Return the variance of a row of the link's balance by its positions' noise, (N·m)²."""
+        if self.q is None:
+            return 0.0
+        read = float(np.mean(stiffness**2)) * self.position_noise(0)[2]
+        return link.inertia_kg_m2**2 * self._within(self.q, 2) + read
+
+    def _within(self, spectrum: Spectrum, order: int) -> float:
+        """Variance of a position's noise within the bandwidth, or of its derivative's."""
         frequency = self.light.frequency_hz
         response = light_response(self) * lowpass(frequency, self.bandwidth_hz)
-        accelerated = inertia**2 * self.noise(moved, (2.0 * np.pi * frequency) ** 2 * response)
-        if self.q is None:
-            return accelerated
-        read = self.noise(self.theta[motor or 0], response) + self.noise(self.q, response)
-        return accelerated + float(np.mean(stiffness**2)) * read
+        return self.noise(spectrum, (2.0 * np.pi * frequency) ** order * response)
 
 
 def count_of(reading: FloatArray) -> float:

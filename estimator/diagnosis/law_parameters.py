@@ -68,17 +68,26 @@ class Base:
         return np.asarray(frame.column(0, more, more) - frame.column(1, 2.0 * np.asarray(energy), None))
 
     def moved(self, frame: Frame, step: FloatArray) -> Base:
-        """Return alpha plus a step, so much of it that the shape stays within its bounds and a half."""
+        """Return alpha plus a step, so much of it that the shape goes half of the way to a bound.
+
+        The first coefficient of a law with a shape follows from the torque at the rms deflection, which is
+        nearly linear in a step along the ridge that the two form.
+        """
         alpha, begin = [], 0
-        for model, old in zip(self.models(frame), self.alpha, strict=True):
+        for i, (model, old) in enumerate(zip(self.models(frame), self.alpha, strict=True)):
             mine, share = step[begin : begin + len(old)], 1.0
             begin += len(old)
             bounds = () if model is None else model.shape_bounds
             for at, by, (low, high) in zip(old[::-1], mine[::-1], bounds[::-1], strict=False):
-                least, most = max(low * 1.0001 + 1e-9, 0.5 * at), min(high * 0.9999, 1.5 * at)
+                least, most = 0.5 * (at + low), min(0.5 * (at + high), 1.5 * at)
                 if at + by != np.clip(at + by, least, most):
                     share = min(share, max(((least if by < 0.0 else most) - at) / by, 0.0))
-            alpha.append(old + share * mine)
+            new = old + share * mine
+            if model is not None and bounds:
+                phi = np.sqrt(np.mean(frame.motors[i].deflection ** 2, keepdims=True))
+                torque = model.torque(phi, old) + model.jacobian(phi, old) @ (share * mine)
+                new[0] = torque[0] / model.torque(phi, np.array([1.0, *new[1:]]))[0]
+            alpha.append(new)
         return replace(self, alpha=tuple(alpha))
 
     def parameters(self, frame: Frame) -> list[dict[str, ParameterValue]]:
@@ -119,14 +128,16 @@ def _search(frame: Frame, i: int, model: TransmissionModel, order: int) -> Float
             f"recording: a deflection of {most:.3g} rad is more than a transmission of model "
             f'"{model.name}" can have: check its units, or declare another model'
         )
+    # A link read late adds its rate to the deflection, on a stiff spring more than all else.
+    beside = np.column_stack((frame.project(frame.motors[i].link_velocity), np.ones(len(target))))
     best, found = np.inf, np.zeros(0)
     for shape in shapes:
         columns = frame.project(np.ascontiguousarray(np.asarray(model.basis(phi, shape, order)).T)).T
-        with_mean = np.column_stack((columns, np.ones(len(columns))))
-        solution, *_ = np.linalg.lstsq(with_mean, target, rcond=None)
-        error = float(np.sum((target - with_mean @ solution) ** 2))
+        design = np.column_stack((columns, beside))
+        solution, *_ = np.linalg.lstsq(design, target, rcond=None)
+        error = float(np.sum((target - design @ solution) ** 2))
         if error < best:
-            best, found = error, np.array([*solution[:-1], *shape])
+            best, found = error, np.array([*solution[: columns.shape[1]], *shape])
     return found
 
 

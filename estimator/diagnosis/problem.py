@@ -199,13 +199,18 @@ class Problem:
 
         The evidence is too optimistic of the first step, and where the next correction of a reading is more
         than its standard deviation: of a hypothesis that is kept it does not stop there. The fit of a healthy
-        joint continues until it converges.
+        joint continues until it converges. A step that leads too far (`_carries`) is halved.
         """
         best = self._linearised(terms, base, corrections, extra, pinned or {})
         for k in range(whole("newton_steps") if steps is None else steps):
             if not self._curved(best) or _converged(best):
                 break
-            now = self._linearised(*self._moved(best), extra, pinned or {})
+            shares = (0.5**j for j in range(whole("newton_steps")))
+            points = (self._moved(best, share) for share in shares)
+            there = next((point for point in points if self._carries(*point[1:])), None)
+            if there is None:
+                break
+            now = self._linearised(*there, extra, pinned or {})
             judged = not self.calibrating and (steps is not None or _read(best))
             if k and judged and now.posterior.evidence < best.evidence(now):
                 break
@@ -213,12 +218,12 @@ class Problem:
         return best
 
     def added(self, fitted: Fitted, term: Term, steps: int | None = None, begin: float = 0.0) -> Fitted:
-        """Return the hypothesis with one more term; that of a reading begins at a correction."""
-        candidate = term.candidate
+        """Return the hypothesis with one more term; that of a reading may begin at a correction."""
         corrections = fitted.corrections
         if begin:
-            name, motor = candidate.key
-            corrections = tuple(corrected(c, name, motor, 0, begin) for c in corrections)
+            name, motor = term.candidate.key
+            there = tuple(corrected(c, name, motor, 0, begin) for c in corrections)
+            corrections = there if self._carries(fitted.base, there) else corrections
         return self.fit((*fitted.terms, term), fitted.base, corrections, steps, pinned=fitted.pinned)
 
     def without(self, fitted: Fitted, k: int, pinned: Pinned | None = None) -> Fitted:
@@ -255,6 +260,17 @@ class Problem:
             made += [frame.project(c.torque) - float(np.mean(frame.project(c.torque))) for c in frame.motors]
             made += [np.zeros(frame.rows)] * (frame.equations - len(frame.motors))
         return np.concatenate(made)
+
+    def _carries(self, base: Base, corrections: tuple[Corrections, ...]) -> bool:
+        """Whether what filters leave of the transmissions' torque is less than what acts on them.
+
+        Beyond that a model says nothing: a step too long leads there of an exponential spring.
+        """
+        frames = self.at(corrections, base)
+        carried = np.concatenate([base.torque(f) for f in frames])
+        exerted = np.concatenate([f.target() - declared_torque(f) for f in frames])
+        most = float(np.linalg.norm(exerted)) + np.sqrt(len(exerted)) * self.torque_rms
+        return bool(choice("floor") * np.linalg.norm(carried) <= most)
 
     def _curved(self, fitted: Fitted) -> bool:
         return any(
@@ -315,9 +331,11 @@ class Problem:
             square[g] += choice("law") ** 2 * float(np.mean(torque[mine] ** 2) + np.mean(laws[mine] ** 2))
         return np.asarray(np.sqrt(square))
 
-    def _moved(self, fitted: Fitted) -> tuple[tuple[Term, ...], Base, tuple[Corrections, ...]]:
-        """The optimum of the linearised model."""
-        x = fitted.posterior.x
+    def _moved(
+        self, fitted: Fitted, share: float = 1.0
+    ) -> tuple[tuple[Term, ...], Base, tuple[Corrections, ...]]:
+        """The optimum of the linearised model, or a share of the way to it."""
+        x = share * fitted.posterior.x
         own = np.array([v for slot, v in zip(fitted.slots, x, strict=True) if slot.kind == "base"])
         base = fitted.base.moved(self.frames[0], own)
         corrections = list(fitted.corrections)

@@ -209,7 +209,7 @@ class Judge:
         for frame, k in zip(
             problem.frames, range(problem.equations - 1, len(floor), problem.equations), strict=True
         ):
-            read = frame.signals.row_noise(None, declared.inertia_kg_m2, frame.motors[0].stiffness)
+            read = frame.signals.row_noise(declared, frame.motors[0].stiffness)
             floor[k] = np.hypot(floor[k], np.sqrt(read))
         left = found.posterior.sigma / floor
         worst = int(np.argmax(left)) % problem.equations

@@ -10,6 +10,7 @@ import struct
 import time
 import zlib
 from contextlib import contextmanager, nullcontext
+from functools import cache
 from pathlib import Path
 
 import can
@@ -57,6 +58,7 @@ def one_line(match=".", error=RecordingError):
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 600
 
 
+@cache
 def zstd_bomb(sized):
     out = io.BytesIO()
     with zstandard.ZstdCompressor().stream_writer(out, size=BOMB if sized else -1, closefd=False) as writer:
@@ -65,10 +67,18 @@ def zstd_bomb(sized):
     return out.getvalue()
 
 
+@cache
 def lz4_bomb():
     with lz4.frame.LZ4FrameCompressor() as packer:
         parts = [packer.begin(), *(packer.compress(bytes(1 << 24)) for _ in range(BOMB >> 24))]
         return b"".join([*parts, packer.flush()])
+
+
+def blf_bomb():
+    packer = zlib.compressobj(1)
+    packed = b"".join([*(packer.compress(bytes(1 << 24)) for _ in range(BOMB >> 24)), packer.flush()])
+    container = struct.pack("<H6xL4x", 2, BOMB) + packed
+    return BLF_HEAD + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(container), 10) + container
 
 
 def chunk(compression, packed, size):
@@ -77,27 +87,55 @@ def chunk(compression, packed, size):
     return struct.pack("<BQ", 0x06, len(body)) + body
 
 
-@pytest.mark.parametrize(
-    ("compression", "packed"),
-    [(b"zstd", lambda: zstd_bomb(True)), (b"zstd", lambda: zstd_bomb(False)), (b"lz4", lz4_bomb)],
-)
-def test_an_mcap_chunk_that_unpacks_without_end_takes_no_memory(compression, packed, tmp_path):
-    path, bomb = tmp_path / "r.mcap", packed()
-    for size, says in ((BOMB, "at most 64 MiB unpacked, got 320 MiB"), (1000, "no samples in it")):
-        path.write_bytes(MAGIC + chunk(compression, bomb, size))
-        with little_memory(), one_line(says):
-            read(path, JOINT)
+def mcap_chunk(*records):
+    """Packed: so many of a record each."""
+    whole = b"".join(count * one for count, one in records)
+    return MAGIC + chunk(b"zstd", zstandard.ZstdCompressor().compress(whole), len(whole))
 
 
-def test_a_blf_container_that_unpacks_without_end_takes_no_memory(tmp_path):
-    path, packer = tmp_path / "r.blf", zlib.compressobj(1)
-    log_of(path, frames(10))
-    packed = b"".join([*(packer.compress(bytes(1 << 24)) for _ in range(BOMB >> 24)), packer.flush()])
-    container = struct.pack("<H6xL4x", 2, BOMB) + packed
-    head = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(container), 10)
-    path.write_bytes(path.read_bytes() + head + container)
-    with little_memory(), one_line("expected containers of at most 64 MiB"):
-        list(read_frames(path))
+def nothing(size):
+    """A record of an unknown kind."""
+    return struct.pack("<BQ", 0x80, size - 9) + bytes(size - 9)
+
+
+def mcap_samples(topic):
+    """Each costs as much as two frames; of a joint at rest they have 8 bytes at least, compressed as can be."""
+    data = mcap_bytes([(topic, 0, b'{"sequence":0,"status":3}')] * 140_000)
+    return data[:8] + nothing(900_009) + data[8:]
+
+
+def mcap_mappings():
+    write, done = "2F001A00{:02d}000000", '{"id": 1409, "data": "60001A0000000000"}'
+    asked = (json.dumps({"id": 0x601, "data": write.format(k % 2)}) for k in range(6000))
+    told = (text.encode() for one in asked for text in (one, done))
+    return mcap_bytes([("can", k * 100_000, data) for k, data in enumerate(told)])
+
+
+UNPACKED = "at most 64 MiB unpacked, got 320 MiB"
+MUCH = {
+    "zstd": ("r.mcap", lambda: MAGIC + chunk(b"zstd", zstd_bomb(True), BOMB), UNPACKED),
+    "zstd, unsized": ("r.mcap", lambda: MAGIC + chunk(b"zstd", zstd_bomb(False), BOMB), UNPACKED),
+    "lz4": ("r.mcap", lambda: MAGIC + chunk(b"lz4", lz4_bomb(), BOMB), UNPACKED),
+    "zstd, little": ("r.mcap", lambda: MAGIC + chunk(b"zstd", zstd_bomb(True), 1000), "no samples in it"),
+    "unsized, little": ("r.mcap", lambda: MAGIC + chunk(b"zstd", zstd_bomb(False), 1000), "no samples in it"),
+    "lz4, little": ("r.mcap", lambda: MAGIC + chunk(b"lz4", lz4_bomb(), 1000), "no samples in it"),
+    "zlib": ("r.blf", blf_bomb, "expected containers of at most 64 MiB"),
+    "records": ("r.mcap", lambda: mcap_chunk(((10 << 20) // 9, nothing(9))), "one record for each"),
+    "bytes": ("r.mcap", lambda: mcap_chunk((60, nothing(1 << 20))), "at most 64 times its size"),
+    "frames": ("r.blf", lambda: BLF_HEAD + blf_frames(100) * 1000, "one record for each"),
+    "bytes of frames": ("r.blf", lambda: BLF_HEAD + blf_frames(200_000), "32 times"),
+    "samples": ("r.mcap", lambda: mcap_samples("sample"), "one record for each"),
+    "estimates": ("r.mcap", lambda: mcap_samples("estimate"), "one record for each"),
+    "mappings": ("r.mcap", mcap_mappings, "changes of what its nodes send"),
+}
+
+
+@pytest.mark.parametrize("what", MUCH)
+def test_a_file_that_unpacks_to_much_is_one_line_and_takes_little_memory(what, tmp_path):
+    name, content, said = MUCH[what]
+    (path := tmp_path / name).write_bytes(content())
+    with little_memory(), one_line(said):
+        list(read_messages(path)) if what == "estimates" else read(path, JOINT)
 
 
 def test_of_many_columns_only_the_known_ones_are_held_and_too_many_are_one_line(tmp_path, caplog):
@@ -189,7 +227,7 @@ def test_no_cut_of_a_log_makes_another_frame(suffix, tmp_path, caplog):
     assert "the last line has no end and is omitted" in caplog.text
 
 
-def mcap_of(path, messages):
+def mcap_bytes(messages):
     """An MCAP file of (topic, stamp in ns, data), its messages in compressed chunks."""
     records, numbers = bytearray(), {}
     for topic, stamp, data in messages:
@@ -201,8 +239,11 @@ def mcap_of(path, messages):
             records += struct.pack("<BQ", 0x04, len(body)) + body
         body = struct.pack("<HIQQ", numbers[topic], 0, stamp, stamp) + data
         records += struct.pack("<BQ", 0x05, len(body)) + body
-    packed = zstandard.ZstdCompressor().compress(bytes(records))
-    path.write_bytes(MAGIC + chunk(b"zstd", packed, len(records)))
+    return mcap_chunk((1, bytes(records)))
+
+
+def mcap_of(path, messages):
+    path.write_bytes(mcap_bytes(messages))
     return path
 
 
@@ -224,40 +265,20 @@ def test_messages_of_others_in_an_mcap_file_are_one_line(tmp_path):
         JsonNumbers(("sequence",))(b'{"sequence": 0, "x": [[], []]}')
 
 
+NUMBERS = "0 -0.0 1.5 1E-7 0.1 1.2345678901234567e-300 123456789012345678901 1e999 5e-324 null NaN -Infinity"
+NO_OBJECTS = '{ {"x"} {"x":1 {"x":1}} {"x":} {,} {"x":1,} {"x":"1"} []'
+
+
 def test_numbers_of_a_message_are_those_that_json_reads():
-    texts = [
-        "0",
-        "-0.0",
-        "1.5",
-        "1E-7",
-        "0.1",
-        "1.2345678901234567e-300",
-        "123456789012345678901",
-        "1e999",
-        "5e-324",
-    ]
-    for text in [*texts, "null", "NaN", "-Infinity", repr(1 / 3), "9" * 400]:
+    for text in [*NUMBERS.split(), repr(1 / 3), "9" * 400]:
         data = f' {{ "other" : "\\"" ,\n"x":{text} , "y":true}} '.encode()
         told = json.loads(data, parse_int=float)["x"]
         found, absent = JsonNumbers(("x", "z"))(data)
-        assert absent is None and struct.pack("<d", found) == struct.pack(
-            "<d", math.nan if told is None else told
-        )
-    for text in (
-        b"",
-        b"{",
-        b'{"x"}',
-        b'{"x":1',
-        b'{"x":1}}',
-        b'{"x":}',
-        b'{"x":1 2}',
-        b"{,}",
-        b'{"x":1,}',
-        b'{"x":"1"}',
-        b"[]",
-    ):
+        told = math.nan if told is None else told
+        assert absent is None and struct.pack("<d", found) == struct.pack("<d", told)
+    for text in ["", '{"x":1 2}', *NO_OBJECTS.split()]:
         with pytest.raises(ValueError, match="expected a"):
-            JsonNumbers(("x",))(text)
+            JsonNumbers(("x",))(text.encode())
 
 
 def test_a_reader_of_others_reads_our_logs(whole):
@@ -364,19 +385,6 @@ def test_frames_are_the_same_whether_drivelink_or_another_tool_wrote_them(tmp_pa
                     assert frame == (1, can_id, bytes.fromhex(data), "")
 
 
-@pytest.mark.parametrize(
-    ("record", "said"), [(9, "one record for each"), (1 << 20, "at most 64 times its size")]
-)
-def test_an_mcap_file_unpacks_to_so_many_records_and_bytes(record, said, tmp_path):
-    whole = (struct.pack("<BQ", 0x80, record - 9) + bytes(record - 9)) * (
-        (10 << 20 if record == 9 else 60 << 20) // record
-    )
-    path = tmp_path / "r.mcap"
-    path.write_bytes(MAGIC + chunk(b"zstd", zstandard.ZstdCompressor().compress(whole), len(whole)))
-    with one_line(said):
-        list(read_messages(path))
-
-
 BLF_HEAD = struct.pack("<4sL136x", b"LOGG", 144)
 
 
@@ -389,16 +397,8 @@ def blf_container(packed, frames_):
     return one + bytes(len(one) % 4)
 
 
-def blf_of(path, frames_, containers):
-    path.write_bytes(BLF_HEAD + blf_container(zlib.compress(blf_frame() * frames_, 9), frames_) * containers)
-    return list(read_frames(path))
-
-
-def test_a_blf_file_unpacks_to_so_many_frames_and_bytes(tmp_path):
-    assert len(blf_of(tmp_path / "r.blf", 100, 10)) == 1000
-    for count, containers, said in ((100, 1000, "one record for each"), (200_000, 1, "32 times")):
-        with one_line(said):
-            blf_of(tmp_path / "r.blf", count, containers)
+def blf_frames(count, can_id=0x80, level=9):
+    return blf_container(zlib.compress(blf_frame(can_id) * count, level), count)
 
 
 def blf_of_objects(path, objects):
@@ -433,7 +433,7 @@ def test_a_blf_container_that_begins_at_the_limit_unpacks_to_nothing(tmp_path):
 def test_a_file_with_too_many_frames_is_refused_where_it_has_them(tmp_path):
     """Not after as many as its whole size allows."""
     path, passed = tmp_path / "r.blf", 0
-    path.write_bytes(BLF_HEAD + blf_container(zlib.compress(blf_frame() * 100, 9), 0) * 5000)
+    path.write_bytes(BLF_HEAD + blf_frames(100) * 5000)
     with one_line("one record for each"):
         for passed, _ in enumerate(read_frames(path), 1):  # noqa: B007
             pass
@@ -444,18 +444,17 @@ def test_a_file_with_too_many_frames_is_refused_where_it_has_them(tmp_path):
         read(path, JOINT)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("cob_id", 1 << 40),
-        ("motor", -1),
-        ("scale", 0.0),
-        ("scale", math.inf),
-        ("bits", 65),
-        ("modulus", -1),
-        ("transmission_type", 256),
-    ],
-)
+NO_LAYOUT = {
+    "cob_id": 1 << 40,
+    "motor": -1,
+    "scale": 0.0,
+    "bits": 65,
+    "modulus": -1,
+    "transmission_type": 256,
+}
+
+
+@pytest.mark.parametrize(("key", "value"), [*NO_LAYOUT.items(), ("scale", math.inf)])
 def test_a_layout_that_no_node_has_is_one_line(key, value, tmp_path):
     """Its numbers were those that the compiled core takes, or a traceback."""
     mapped = {"signal": "other", "index": 0x6064, "subindex": 0, "bits": 32, "signed": True}
@@ -476,16 +475,6 @@ def test_topics_without_end_take_no_memory(tmp_path):
     assert path.stat().st_size < 40_000
     with little_memory(60):
         assert list(read_messages(path)) == []
-
-
-def test_a_megabyte_changes_mappings_less_often_than_it_has_frames(tmp_path):
-    write, done = "2F001A00{:02d}000000", '{"id": 1409, "data": "60001A0000000000"}'
-    frames = []
-    for k in range(6000):
-        frames += [json.dumps({"id": 0x601, "data": write.format(k % 2)}), done]
-    path = mcap_of(tmp_path / "r.mcap", [("can", k * 100_000, f.encode()) for k, f in enumerate(frames)])
-    with one_line("changes of what its nodes send"):
-        read(path, JOINT)
 
 
 def test_mappings_that_change_without_a_sync_end_at_the_limit_not_at_the_file_s_end(tmp_path, monkeypatch):
@@ -542,16 +531,6 @@ def test_syncs_further_apart_than_any_cycle_are_one_line(tmp_path):
             work()
 
 
-@pytest.mark.parametrize("topic", ["sample", "estimate"])
-def test_a_megabyte_has_fewer_samples_and_estimates_than_frames(topic, tmp_path):
-    """Each costs as much as two frames; of a joint at rest they have 8 bytes at least, compressed as can be."""
-    path = mcap_of(tmp_path / "r.mcap", [(topic, 0, b'{"sequence":0,"status":3}')] * 140_000)
-    data = path.read_bytes()
-    path.write_bytes(data[:8] + struct.pack("<BQ", 0x80, 900_000) + bytes(900_000) + data[8:])
-    with one_line("one record for each"):
-        list(read_messages(path))
-
-
 @pytest.mark.parametrize(
     ("can_id", "read_of_it", "said"),
     [
@@ -562,8 +541,7 @@ def test_a_megabyte_has_fewer_samples_and_estimates_than_frames(topic, tmp_path)
 def test_a_log_that_is_none_of_canopen_is_not_read_to_its_end(
     can_id, read_of_it, said, tmp_path, monkeypatch
 ):
-    packed = zlib.compress(blf_frame(can_id) * 5000, 0)
-    (tmp_path / "r.blf").write_bytes(BLF_HEAD + blf_container(packed, 5000) * 30)
+    (tmp_path / "r.blf").write_bytes(BLF_HEAD + blf_frames(5000, can_id, 0) * 30)
     kind, passed = CAN_FORMATS[".blf"], []
     counting = kind._replace(reader=lambda *a: (passed.append(1) or frame for frame in kind.reader(*a)))
     monkeypatch.setitem(CAN_FORMATS, ".blf", counting)

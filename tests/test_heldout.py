@@ -1,6 +1,5 @@
 """What data that took no part in a fit say about its intervals: ratios of errors that are known in closed form."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import diagnosiskit as kit
@@ -175,80 +174,78 @@ def test_a_scale_and_a_part_of_a_ripple_are_told_apart_by_a_whole_turn(amplitude
     assert alike == [(frozenset({("kinematic_error", 0)}), False)] * open_
 
 
-def test_a_file_that_explains_less_than_the_declared_one_is_not_written(healthy):
-    model = kit.model()
-
-    def with_spring(stiffness: float) -> JointModel:
-        own = Transmission(model="linear", parameters={"k_nm_rad": stiffness})
-        return replace(model, motors=(replace(model.motors[0], transmission=own),))
-
-    right, soft = with_spring(kit.STIFFNESS), with_spring(0.5 * kit.STIFFNESS)
-    for declared, written, said in (
-        (soft, right, "None"), (right, right, "None"), (model, right, "None"),
-        (right, soft, "N·m of the torque, the declared one"), (model, with_spring(3.0 * kit.STIFFNESS), "no model"),
-    ):  # fmt: skip
-        assert said in str(harm(declared, written, [Unseen.whole(healthy)]))
+def sprung(share: float, link: float = 1.0, **more: object) -> JointModel:
+    """The joint with a spring, and a link's inertia, of so many times the true one."""
+    known = kit.model()
+    law = Transmission(model="linear", parameters={"k_nm_rad": share * kit.STIFFNESS}, **more)
+    assert known.link is not None
+    heavier = replace(known.link, inertia_kg_m2=link * kit.LINK_INERTIA)
+    return replace(known, motors=(replace(known.motors[0], transmission=law),), link=heavier)
 
 
-def test_a_file_that_makes_the_estimator_worse_is_not_written(healthy):
-    """Its balance leaves less than no model, but the declared file is right on line."""
-    model = kit.model()
+SURE = {"covariance": ((0.01,),)}  # data do not move it
 
-    def surely(share: float) -> JointModel:
-        own = Transmission(
-            model="linear",
-            parameters={"k_nm_rad": share * kit.STIFFNESS},
-            covariance=((0.01,),),  # data do not move it
-        )
-        return replace(model, motors=(replace(model.motors[0], transmission=own),))
 
-    for written, said in (
-        (surely(1.0), "None"), (surely(0.95), "valid estimates leave"),
-        (model, "do not determine the stiffness of motor 1"),
-    ):  # fmt: skip
-        assert said in str(harm(model, written, [Unseen.whole(healthy)]))
+@pytest.mark.parametrize(
+    ("declared", "written", "said"),
+    [
+        (sprung(0.5), sprung(1.0), "None"),
+        (sprung(1.0), sprung(1.0), "None"),
+        (kit.model(), sprung(1.0), "None"),
+        (sprung(1.0), sprung(0.5), "N·m of the torque, the declared one"),
+        (kit.model(), sprung(3.0), "no model"),
+        (sprung(1e-3), sprung(1e-3), "more than its spring carries"),
+        # On line: the balance leaves less than no model, but the declared file is right.
+        (kit.model(), sprung(1.0, **SURE), "None"),
+        (kit.model(), sprung(0.95, **SURE), "valid estimates leave"),
+        (kit.model(), kit.model(), "do not determine the stiffness of motor 1"),
+        # The motors' balances know nothing of the link's inertia.
+        (sprung(1.0), sprung(1.0, 1.3), "free runs over held-out data err"),
+        (sprung(1.0, 1.3), sprung(1.0), "None"),
+    ],
+)
+def test_a_file_that_is_worse_than_the_declared_one_is_not_written(declared, written, said, healthy):
+    assert said in str(harm(declared, written, [Unseen.whole(healthy)]))
 
 
 @pytest.mark.parametrize(("seen", "worse"), [(0.6, True), (0.93, False), (1.0, False)])
 def test_validity_that_falls_by_more_than_its_standard_error_is_harm(seen, worse, healthy, monkeypatch):
-    model = kit.model()
-    law = Transmission(model="linear", parameters={"k_nm_rad": kit.STIFFNESS})
-    written = replace(model, motors=(replace(model.motors[0], transmission=law),))
+    written = sprung(1.0)
 
     def replayed(of: JointModel, *_: object) -> FloatArray:
         valid = np.full(10, seen if of is written else 0.95) + np.linspace(-0.05, 0.0, 10)
         return np.column_stack((valid, np.full((10, 2), np.nan)))
 
     monkeypatch.setattr("estimator.harm._replayed", replayed)
-    assert ("estimates are valid" in str(harm(model, written, [Unseen.whole(healthy)]))) is worse
+    assert ("estimates are valid" in str(harm(kit.model(), written, [Unseen.whole(healthy)]))) is worse
 
 
-def test_what_valid_estimates_leave_is_compared_over_the_same_samples(healthy, monkeypatch):
+@pytest.mark.parametrize(("more", "said"), [(0.0, "None"), (1.0, "valid estimates leave")])
+def test_what_valid_estimates_leave_is_compared_over_the_same_samples(more, said, healthy, monkeypatch):
     """The declared model, which is valid in the easy half alone, leaves as much there."""
-    model = kit.model()
-    law = Transmission(model="linear", parameters={"k_nm_rad": kit.STIFFNESS})
-    written = replace(model, motors=(replace(model.motors[0], transmission=law),))
-    easy = np.arange(400) % 2 == 0
+    written, easy = sprung(1.0), np.arange(400) % 2 == 0
 
-    def replayed(more: float) -> Callable[..., FloatArray]:
-        def of(played: JointModel, *_: object) -> FloatArray:
-            valid = easy | (played is written)
-            left = np.where(easy, 1.0 + more * (played is written), 100.0)
-            return np.column_stack((valid, np.where(valid, left, np.nan), np.full(400, np.nan)))
+    def replayed(of: JointModel, *_: object) -> FloatArray:
+        valid = easy | (of is written)
+        left = np.where(easy, 1.0 + more * (of is written), 100.0)
+        return np.column_stack((valid, np.where(valid, left, np.nan), np.full(400, np.nan)))
 
-        return of
+    monkeypatch.setattr("estimator.harm._replayed", replayed)
+    assert said in str(harm(kit.model(), written, [Unseen.whole(healthy)]))
 
-    for more, said in ((0.0, "None"), (1.0, "valid estimates leave")):
-        monkeypatch.setattr("estimator.harm._replayed", replayed(more))
-        assert said in str(harm(model, written, [Unseen.whole(healthy)]))
+
+def axis(more: str) -> jointfile.JointFile:
+    return jointfile.parse(
+        f'name = "axis"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\nviscous_damping_nm_s_rad = {kit.DAMPING}\n{more}\n'
+    )
+
+
+RIGID = 'transmission = { model = "none" }'
 
 
 def test_a_constant_torque_of_a_rigid_joint_is_written_beside_what_is_found():
     """The file's balance leaves what the diagnosis says that it leaves."""
-    joint = jointfile.parse(
-        f'name = "axis"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\nviscous_damping_nm_s_rad = {kit.DAMPING}\n'
-        'transmission = { model = "none" }\n'
-    )
+    joint = axis(RIGID)
     theta, _, own = motion()
     torque = own + 0.8 * np.sign(np.gradient(theta)) + 0.5
     found = diagnose(joints.recorded(theta, torque, None), joint.model(), BANDWIDTH_HZ)
@@ -260,31 +257,25 @@ def test_a_constant_torque_of_a_rigid_joint_is_written_beside_what_is_found():
 @pytest.mark.parametrize("gear", [1.0, 50.0])
 def test_gravity_of_a_rigid_joint_that_declares_none_is_named_and_written(gear):
     """Once a turn, cogging looks like it where the motor has no gear."""
-    joint = jointfile.parse(
-        f'name = "axis"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\nviscous_damping_nm_s_rad = {kit.DAMPING}\n'
-        f'transmission = {{ model = "none" }}\ndrive = {{ node_id = 1, gear_ratio = {gear} }}\n'
-    )
+    joint = axis(f"{RIGID}\ndrive = {{ node_id = 1, gear_ratio = {gear} }}")
     theta, _, own = motion(8.0)
     turned = np.interp(np.arange(len(theta)) + 0.5, np.arange(len(theta)), theta)
-    axis = joints.recorded(theta, own + 2.0 * np.sin(turned) - 1.0 * np.cos(turned), None)
-    found = diagnose(axis, joint.model(), BANDWIDTH_HZ)
+    moved = joints.recorded(theta, own + 2.0 * np.sin(turned) - 1.0 * np.cos(turned), None)
+    found = diagnose(moved, joint.model(), BANDWIDTH_HZ)
     (gravity,) = found.effects
     assert gravity.name == "gravity" and set(gravity.alternatives) <= {"cogging"}
     assert gravity.probability == 0.5 if gear == 1.0 else gravity.probability > 0.9
     assert gravity.parameters == pytest.approx({"sin_nm": 2.0, "cos_nm": -1.0}, abs=0.01)
     assert found.curves[0].fitted_nm == pytest.approx(found.curves[0].residual_nm, abs=0.05)
     written = diagnosed_model(joint, found)
-    assert max(second.residual_nm[0] for second in seconds_of(axis, written)) < 0.02
-    assert free_run(axis, written).fit_percent["motor1_position"] > 98.0
-    assert diagnose(axis, written, BANDWIDTH_HZ).verdict == "sufficient"
+    assert max(second.residual_nm[0] for second in seconds_of(moved, written)) < 0.02
+    assert free_run(moved, written).fit_percent["motor1_position"] > 98.0
+    assert diagnose(moved, written, BANDWIDTH_HZ).verdict == "sufficient"
 
 
 def test_a_constant_torque_of_the_motors_side_alone_is_written_as_the_zero_of_its_encoders():
     """As `fit` does: with half of it as either, or all as a torque, what the spring carries was off by it."""
-    joint = jointfile.parse(
-        f'name = "axis"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\nviscous_damping_nm_s_rad = {kit.DAMPING}\n'
-        'transmission = { model = "linear" }\n'
-    )
+    joint = axis('transmission = { model = "linear" }')
     healthy, zero = record(SOFT, strange_nm=0.0), 0.008
     assert healthy.link_position_rad is not None
     found = diagnose(replace(healthy, link_position_rad=healthy.link_position_rad + zero), joint.model())
@@ -294,22 +285,6 @@ def test_a_constant_torque_of_the_motors_side_alone_is_written_as_the_zero_of_it
     (written,) = (e for e in diagnosed_model(joint, found).motors[0].effects if "offset" in e.name)
     assert written.name == "deflection_offset"
     assert written.parameters["offset_rad"] == pytest.approx(zero, rel=0.02)
-
-
-def test_a_file_is_not_written_while_its_balance_leaves_more_than_the_spring_carries(healthy):
-    model, law = kit.model(), Transmission(model="linear", parameters={"k_nm_rad": 1e-3 * kit.STIFFNESS})
-    weak = replace(model, motors=(replace(model.motors[0], transmission=law),))
-    assert "more than its spring carries" in str(harm(weak, weak, [Unseen.whole(healthy)]))
-
-
-def test_a_model_that_foresees_positions_worse_is_not_written(healthy):
-    """The motors' balances know nothing of the link's inertia."""
-    law, right = Transmission(model="linear", parameters={"k_nm_rad": kit.STIFFNESS}), kit.model()
-    right = replace(right, motors=(replace(right.motors[0], transmission=law),))
-    assert right.link is not None
-    wrong = replace(right, link=replace(right.link, inertia_kg_m2=1.3 * kit.LINK_INERTIA))
-    assert "free runs over held-out data err" in str(harm(right, wrong, [Unseen.whole(healthy)]))
-    assert harm(wrong, right, [Unseen.whole(healthy)]) is None
 
 
 def test_the_last_quarter_is_judged_by_a_model_made_of_the_others(healthy):

@@ -193,13 +193,3 @@ def test_what_comes_faster_than_it_is_used_keeps_nobody_from_flushing_and_ending
         if what != "monitor":
             recorder.taps.append(tap)
             recorder.run(lambda: next(came) > 2_000)
-
-
-def test_the_line_that_was_rewritten_is_erased_before_the_result(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    joint = jointfile.load(Path(jointfile.__file__).parents[1] / "joints" / "vsa-ii.toml")
-    with Recorder(open_sink(tmp_path / "a.csv", joint, ""), []) as recorder:
-        summary = _Summary(tmp_path / "a.csv", recorder)
-        summary.tick()
-        summary.clear()
-    assert capsys.readouterr().err.endswith("Ctrl-C ends \r\x1b[K")

@@ -215,15 +215,6 @@ def test_what_is_strange_in_a_log_is_said(recorded, tmp_path, caplog):
     assert playback.period_s == 0.001 and "SYNC comes every 0.001 s" in caplog.text
 
 
-def test_raw_frames_and_samples_make_the_same_record(recorded):
-    first = read(recorded.folder / "r.csv", recorded.joint)
-    for suffix in (".log", ".mcap"):
-        other = read(recorded.folder / f"r{suffix}", recorded.joint)
-        assert np.array_equal(first.motor_position_rad, other.motor_position_rad)
-        assert np.array_equal(first.motor_torque_nm, other.motor_torque_nm)
-        assert first.period_s == other.period_s
-
-
 def test_a_kept_recording_whose_samples_were_dropped_is_diagnosed_by_its_frames(recorded, tmp_path):
     text, kept = daemonkit.vsa_text(), tmp_path / "kept.mcap"
     sink = open_sink(kept, recorded.joint, text)

@@ -252,17 +252,6 @@ def test_a_frame_that_shares_its_identifier_with_ours_is_switched_off_whatever_t
     assert layout.tpdos[0].cob_id == 0x185 and slave.objects[0x1803, 1].value & INVALID
 
 
-class Stopped(Slave):
-    """Stopped by somebody, it has no SDO (CiA 301, 7.3.2.2.4)."""
-
-    def handle(self, cob_id, data):
-        return [] if cob_id and self.state == 4 else super().handle(cob_id, data)
-
-
-def test_a_node_that_was_stopped_before_we_came_is_woken():
-    configured(Stopped(5, drive_objects(5), state=4))
-
-
 class Failing(Wire):
     """A bus that every third frame cannot be sent to."""
 

@@ -50,127 +50,87 @@ EDS = eds_text(
 
 
 TIMEOUT_S = 0.5
-UPLOAD, ANSWER, FORGED = (
-    bytes.fromhex(x) for x in ("4076600000000000", "4376600020030000", "4376600088130000")
+
+
+WRITE, DONE, REFUSED = ">2b17100064000000", "<6017100000000000", "<8017100030000906"
+ASKED, TOLD, LIE = ">4076600000000000", "<4376600020030000", "<4376600088130000"
+NO_SUCH, MASTER_ENDS = "<8076600000000206", ">8017100000000405"
+BEGUN = f"{ASKED} <4176600004000000"  # an answer in segments
+PARTS, LAST = f"{BEGUN} >6000000000000000", "<0720030000000000"
+NAME = (
+    ">4008100000000000 <4108100010000000 >6000000000000000 <0041424344454647 "
+    ">7000000000000000 <1041424344454647 >6000000000000000 <0B41420000000000"
 )
+# Number 33 of a block's segments looks like the begin of a download.
+BLOCK = ">c2001a0104000000 <a0001a017f000000 >21001a0102030405 >a200000000000000"
+UNMAP, READ_MAP = ">2f001a0000000000 <60001a0000000000", ">40001a0100000000 <43001a0120006460"
+KEPT, UNIT, MAPPED = {(0x1017, 0): 100}, {(0x6076, 0): 800}, {(0x1A00, 1): 0x60640020}
+NO_MAP, OF_UNIT, OF_WRITE, OF_MAP = {(0x1A00, 0): 0}, {(0x6076, 0)}, {(0x1017, 0)}, {(0x1A00, 1)}
+TRANSFERS = [
+    # What is heard (">" of the master, "<" of the node, "1": a second), values, disputed, how many unasked;
+    # None where it does not matter.
+    (WRITE, {}, set(), 0),
+    (f"{WRITE} {REFUSED}", {}, set(), 0),
+    (f"{WRITE} {DONE}", KEPT, set(), 0),
+    (">2f001a0000 <60001a00", NO_MAP, set(), 0),  # fewer than eight bytes, as some nodes take them
+    ("< > >40", {}, set(), 0),
+    (">21011a0104000000 <60011a0100000000 >0720006460000000 <2000000000000000", {(0x1A01, 1): 0x60640020}, set(), 0),
+    (f"{PARTS} {LAST}", UNIT, set(), 0),
+    # An answer that belongs to no request is ignored.
+    (LIE, {}, set(), 1),
+    (DONE, {}, set(), 1),
+    (f"{ASKED} 1 {LIE}", {}, set(), 1),  # long ago
+    (f"{WRITE} 1 {DONE}", {}, set(), 1),
+    (f">4075600000000000 {LIE}", {}, set(), 1),  # for another object
+    (f"{ASKED} <6076600000000000", {}, set(), 1),  # a download's confirmation
+    (f"{ASKED} {LAST}", {}, set(), 1),  # a segment of a transfer that has none
+    (f"{PARTS} <1720030000000000", {}, set(), 1),  # the wrong toggle bit
+    (f"{BEGUN} {LAST}", {}, set(), 1),  # a segment before it is asked for
+    (f"{BEGUN} >7000000000000000 <1720030000000000", {}, set(), 1),  # asked for out of order
+    (f"{WRITE} {MASTER_ENDS} {DONE}", {}, OF_WRITE, 1),
+    # Two different answers to one request dispute the object until it is read again.
+    (f"{ASKED} {LIE} {TOLD}", None, OF_UNIT, None),
+    (f"{ASKED} {TOLD} {LIE}", None, OF_UNIT, None),
+    (f"{ASKED} {LIE} {NO_SUCH}", None, OF_UNIT, None),  # the node has no such object
+    (f"{ASKED} {NO_SUCH} {LIE}", None, OF_UNIT, None),
+    (f"{PARTS} <0788130000000000 {LAST}", None, OF_UNIT, None),
+    (f"{ASKED} {LIE} {TOLD} {ASKED} {TOLD}", UNIT, set(), None),
+    (f"{ASKED} {TOLD} {TOLD}", UNIT, set(), None),  # the same again is no dispute
+    # A download that is given up may have been made.
+    (f"{WRITE} {MASTER_ENDS}", None, OF_WRITE, None),
+    (f"{WRITE} {ASKED}", None, OF_WRITE, None),
+    (f"{WRITE} {ASKED} {WRITE} {DONE}", KEPT, set(), 0),
+    (f"{WRITE} {REFUSED} {ASKED}", {}, set(), 0),
+    # Long and block transfers of others are no forgeries; a block download leaves its object disputed.
+    (NAME, {}, set(), 0),
+    (">c0501f0100000000 <a4501f017f000000", {}, None, 0),
+    (BLOCK, {}, OF_MAP, 0),
+    (f"{BLOCK} >c100000000000000 <a100000000000000", {}, OF_MAP, 0),
+    (f"{BLOCK} >c100000000000000 <a100000000000000 {READ_MAP}", MAPPED, set(), 0),
+    # One that is refused or given up hides no other write: the node is mapped anew at once.
+    (f">c2501f0100010000 <80501f0122000106 {UNMAP}", NO_MAP, None, 0),
+    (f">c2501f0100010000 >80501f0100000405 {UNMAP}", NO_MAP, None, 0),
+]  # fmt: skip
 
 
-def heard(*frames, listener=None, now_s=0.0):
-    """What a listener makes of a transfer; ">" from the master, "<" from the node, one second apart where "1"."""
-    listener = listener or SdoSniffer(lambda index, subindex: True, TIMEOUT_S)
-    for frame in frames:
-        if frame == "1":
-            now_s += 1.0
-            continue
-        data = bytes.fromhex(frame[1:])
-        listener.request(data, now_s) if frame[0] == ">" else listener.response(data, now_s)
-    return listener
+@pytest.mark.parametrize(("frames", "values", "disputed", "unasked"), TRANSFERS)
+def test_refused_forged_and_disputed_transfers_are_told_from_those_that_count(
+    frames, values, disputed, unasked
+):
+    listener, now_s = SdoSniffer(lambda index, subindex: True, TIMEOUT_S), 0.0
+    for frame in frames.split():
+        now_s += frame == "1"
+        if frame != "1":
+            say = listener.request if frame[0] == ">" else listener.response
+            say(bytes.fromhex(frame[1:]), now_s)
+    found = (listener.values, listener.disputed, listener.unasked)
+    expected = (values, disputed, unasked)
+    assert all(one is None or one == other for one, other in zip(expected, found, strict=True)), found
 
 
-def test_a_download_counts_only_when_the_node_confirms_it():
-    write, refused, done = ">2b17100064000000", "<8017100030000906", "<6017100000000000"
-    listener = heard(write)
-    assert listener.values == {}
-    assert heard(refused, listener=listener).values == {}
-    assert heard(write, done).values == {(0x1017, 0): 100}
-
-
-def test_frames_of_fewer_than_eight_bytes_count_as_some_nodes_take_them():
-    listener = heard(">2f001a0000", "<60001a00")
-    assert listener.values == {(0x1A00, 0): 0} and listener.written
+def test_the_object_of_a_write_is_named_however_short_its_frame():
     assert written_object(bytes.fromhex("2310100173")) == (0x1010, 1)
-    assert written_object(b"") is None and heard("<", ">", ">40", listener=listener).unasked == 0
-
-
-def test_segmented_transfers_are_followed_both_ways():
-    listener = heard(
-        ">21011a0104000000",  # download, 4 bytes in segments
-        "<60011a0100000000",
-        ">0720006460000000",  # last segment, 3 bytes unused
-        "<2000000000000000",
-    )
-    assert listener.values == {(0x1A01, 1): 0x60640020}
-    upload = (">4076600000000000", "<4176600004000000", ">6000000000000000", "<0720030000000000")
-    assert heard(*upload, listener=listener).values[0x6076, 0] == 800
-    assert listener.unasked == 0
-
-
-WRITE = ">2b17100064000000"
-DONE = "<6017100000000000"
-ASKED, TOLD, LIE = f">{UPLOAD.hex()}", f"<{ANSWER.hex()}", f"<{FORGED.hex()}"
-SEGMENTS = (ASKED, "<4176600004000000", ">6000000000000000")
-
-
-@pytest.mark.parametrize(
-    "frames",
-    [
-        (LIE,),  # nobody has asked
-        (DONE,),
-        (ASKED, "1", LIE),  # long ago
-        (WRITE, "1", DONE),
-        (">4075600000000000", LIE),  # for another object
-        (ASKED, "<6076600000000000"),  # a download's confirmation
-        (ASKED, "<0720030000000000"),  # a segment of a transfer that has none
-        (*SEGMENTS, "<1720030000000000"),  # the wrong toggle bit
-        (*SEGMENTS[:2], "<0720030000000000"),  # a segment before it is asked for
-        (*SEGMENTS[:2], ">7000000000000000", "<1720030000000000"),  # asked for out of order
-        (WRITE, ">8017100000000405", DONE),  # given up by the master
-    ],
-)
-def test_an_answer_that_belongs_to_no_request_is_counted_and_ignored(frames):
-    listener = heard(*frames)
-    assert listener.values == {}
-    assert listener.unasked == 1
-
-
-@pytest.mark.parametrize(
-    "frames",
-    [
-        (ASKED, LIE, TOLD),
-        (ASKED, TOLD, LIE),
-        (ASKED, LIE, "<8076600000000206"),  # the node has no such object
-        (ASKED, "<8076600000000206", LIE),
-        (*SEGMENTS, "<0788130000000000", "<0720030000000000"),
-    ],
-)
-def test_two_different_answers_to_one_request_dispute_the_object_until_it_is_read_again(frames):
-    listener = heard(*frames)
-    assert listener.disputed == {(0x6076, 0)}
-    assert heard(ASKED, TOLD, listener=listener).values == {(0x6076, 0): 800}
-    assert listener.disputed == set()
-    assert heard(ASKED, TOLD, TOLD).disputed == set()  # the same again is no dispute
-
-
-@pytest.mark.parametrize("next_request", [">8017100000000405", ">4076600000000000"])
-def test_a_download_that_is_given_up_may_have_been_made(next_request):
-    assert heard(WRITE, next_request).disputed == {(0x1017, 0)}
-    assert heard(WRITE, next_request, WRITE, DONE).disputed == set()
-    assert heard(WRITE, "<8017100030000906", next_request).disputed == set()  # refused: it was not
-
-
-def test_long_and_block_transfers_of_others_are_no_forgeries():
-    name = (">4008100000000000", "<4108100010000000")
-    name += (">6000000000000000", "<0041424344454647", ">7000000000000000", "<1041424344454647")
-    listener = heard(*name, ">6000000000000000", "<0B41420000000000")
-    assert (listener.values, listener.unasked) == ({}, 0)
-    assert heard(">c0501f0100000000", "<a4501f017f000000").unasked == 0
-
-
-def test_the_object_of_a_block_download_is_disputed_until_it_is_read_again():
-    segment = ">21001a0102030405"  # number 33: it looks like the begin of a download
-    listener = heard(">c2001a0104000000", "<a0001a017f000000", segment, ">a200000000000000")
-    assert listener.disputed == {(0x1A00, 1)} and listener.pending is None and listener.unasked == 0
-    heard(">c100000000000000", "<a100000000000000", listener=listener)
-    assert listener.disputed == {(0x1A00, 1)}
-    heard(">40001a0100000000", "<43001a0120006460", listener=listener)
-    assert (listener.disputed, listener.values) == (set(), {(0x1A00, 1): 0x60640020})
-
-
-@pytest.mark.parametrize("end", ["<80501f0122000106", ">80501f0100000405"])
-def test_a_block_download_that_is_refused_or_given_up_hides_no_other_write(end):
-    """The node that refuses firmware is mapped anew at once: those writes are no segments."""
-    listener = heard(">c2501f0100010000", end, ">2f001a0000000000", "<60001a0000000000")
-    assert listener.values == {(0x1A00, 0): 0}
+    assert written_object(b"") is None
 
 
 def after(configurator, *frames):

@@ -12,7 +12,7 @@ from numpy.polynomial import Polynomial
 
 from drivelink.demo.simulate import world_from_joint
 from drivelink.jointfile import load
-from estimator import JointModel, Motor, Sample, Status, Transmission
+from estimator import JointModel, Motor, Sample, Transmission
 from sim.cases import case
 from sim.world import record
 
@@ -107,142 +107,126 @@ def test_rounding_at_rest_is_no_effect(seed):
             assert estimator.undeclared() == [[]] and estimate.status & kit.VALID, at_s
 
 
-def rebooted(motion, name, off, doubted=-1):
-    """Estimates and estimator, sample by sample; the first motor counts from elsewhere after LOST samples."""
-    estimator = kit.make_estimator(kit.declared(name), kit.EstimatorSettings(), kit.PERIOD_S)
-    for k, sample in enumerate(motion.samples):
-        if k == LOST:
-            estimator.lose_zeros()
-        if k == LOST + doubted:
-            estimator.distrust()
-        moved = sample.motor_position_rad[0] + (off if k >= LOST else 0.0)
-        one = estimator.step(sample._replace(motor_position_rad=(moved, *sample.motor_position_rad[1:])))
-        assert doubted >= 0 or k != LOST + 500 or estimator.why()[0] == "lost"
-        yield one.status & 1, one.stiffness_nm_rad, one.flexibility_torque_nm
-
-
 LOST = 6000
+
+
+def first(sample, off):
+    own, *others = sample.motor_position_rad
+    return sample._replace(motor_position_rad=(own + off, *others))
+
+
+def second(sample, off):
+    own, other = sample.motor_position_rad
+    return sample._replace(motor_position_rad=(own, other + off))
+
+
+def link(sample, off):
+    return sample._replace(link_position_rad=sample.link_position_rad + off)
+
+
+def rebooted(joint, samples, offs, reads=first, look=lambda _k, _estimator: None):
+    """Estimates and estimator; from each of these samples on a reading is off by so much, as after a reboot."""
+    begin = sorted(offs)
+    off = np.array([0.0, *(offs[k] for k in begin)])[np.searchsorted(begin, range(len(samples)), "right")]
+
+    def began(k, estimator):
+        if k + 1 in offs:
+            estimator.lose_zeros()
+        look(k, estimator)
+
+    return kit.play(joint, map(reads, samples, off.tolist()), look=began)
+
+
+def is_right(found, motion, valid, begin=0):
+    """What is valid has a torque within the limit of the fault matrix, a quarter of the torque's rms."""
+    off = np.abs(found.torque_nm - motion.torque_nm)[begin:][valid[begin:]]
+    return len(off) and np.all(off < kit.WRONG_TORQUE * np.sqrt(np.mean(motion.torque_nm**2)))
 
 
 @mostly_slow(("name", "off"), ("constant", 0.1), ("quadratic", 0.0), ("vsa-ii", 2.6))
 def test_a_drive_that_counts_from_elsewhere_after_a_reboot_is_not_believed_before_motion_has_shown_from_where(
     name, off
 ):
-    motion = kit.motion(name, 14.0)
-    valid, stiffness, torque = np.array(list(rebooted(motion, name, off))).T
-    valid = valid > 0
-    assert valid[LOST - 1000 : LOST].all()
-    assert valid[-4000:].mean() > 0.9
-    assert np.all(np.abs(stiffness / motion.stiffness_nm_rad - 1.0)[valid] < 0.1)
-    # The limit of the fault matrix, a quarter of the torque's rms.
-    assert np.all(np.abs(torque - motion.torque_nm)[valid] < 0.25 * np.sqrt(np.mean(motion.torque_nm**2)))
+    motion, said = kit.motion(name, 14.0), []
+    look = lambda k, estimator: k == LOST + 500 and said.append(estimator.why()[0])  # noqa: E731
+    found, _ = rebooted(kit.declared(name), motion.samples, {LOST: off}, look=look)
+    assert said == ["lost"]
+    assert found.valid[LOST - 1000 : LOST].all() and found.valid[-4000:].mean() > 0.9
+    assert np.all(np.abs(found.stiffness_nm_rad / motion.stiffness_nm_rad - 1.0)[found.valid] < 0.1)
+    assert is_right(found, motion, found.valid)
 
 
 @pytest.mark.parametrize(
     ("name", "factor"),
     [
         ("quadratic", 0.8),
-        *(
-            pytest.param(*case, marks=SLOW)
-            for case in (("quadratic", 1.5), ("constant", 0.8), ("vsa-ii", 1.2))
-        ),
+        pytest.param("quadratic", 1.5, marks=SLOW),
+        pytest.param("constant", 0.8, marks=SLOW),
+        pytest.param("vsa-ii", 1.2, marks=SLOW),
     ],
 )
 def test_a_spring_that_is_another_one_after_a_reboot_is_learned_anew(name, factor):
     """What was known of it before was believed for ever, or effects made up for what was wrong of it."""
-    motion, estimates = kit.motion(name, 30.0, seed=2, step=(9.0, factor)), []
-    estimator = kit.make_estimator(kit.declared(name), kit.EstimatorSettings(), kit.PERIOD_S)
-    for k, sample in enumerate(motion.samples):
-        if k == 9000:
-            estimator.lose_zeros()
-        one = estimator.step(sample)
-        estimates.append((one.status & 1, one.stiffness_nm_rad, one.stiffness_std_nm_rad))
-    valid, stiffness, std = np.array(estimates).T
-    valid = valid > 0
+    motion = kit.motion(name, 30.0, seed=2, step=(9.0, factor))
+    found, estimator = rebooted(kit.declared(name), motion.samples, {9000: 0.0})
+    valid = found.valid
     assert valid[8000:9000].all() and valid[-5000:].all() and not any(estimator.undeclared())
-    off = np.abs(stiffness - motion.stiffness_nm_rad)[valid]
-    assert np.all(off < np.maximum(0.1 * motion.stiffness_nm_rad, 3.0 * std)[valid])
+    off = np.abs(found.stiffness_nm_rad - motion.stiffness_nm_rad)
+    assert np.all((off < np.maximum(0.1 * motion.stiffness_nm_rad, 3.0 * found.std_nm_rad))[valid])
     assert np.all(off[-5000:] < 0.01 * motion.stiffness_nm_rad[-5000:])
 
 
-@pytest.mark.parametrize("first", [0.0, 1.8])
-def test_a_reboot_after_another_loses_one_motors_zero_and_nothing_that_was_found_since_the_first(first):
+@pytest.mark.parametrize("begun", [0.0, 1.8])
+def test_a_reboot_after_another_loses_one_motors_zero_and_nothing_that_was_found_since_the_first(begun):
     """Also where the first one was needed: what was read then is no measure of where the law is to hold."""
-    motion, offs = kit.motion("vsa-ii", 16.0), {0: first, 1000: 0.1, 8000: 2.7}
-    estimator = kit.make_estimator(kit.declared("vsa-ii"), kit.EstimatorSettings(), kit.PERIOD_S)
-    off, said, valid = first, set(), []
-    for k, sample in enumerate(motion.samples):
-        if k in offs:
-            off = offs[k]
-            estimator.lose_zeros()
-        own, other = sample.motor_position_rad
-        status = estimator.step(sample._replace(motor_position_rad=(own, other + off))).status
-        valid.append(bool(status & 1))
-        reason = estimator.why()
-        if k >= 10000 and reason and reason[0] == "lost":
+    samples, said = kit.motion("vsa-ii", 16.0).samples, set()
+
+    def look(k, estimator):
+        reason = estimator.why() if k >= 10000 else None
+        if reason and reason[0] == "lost":
             said.add(reason[1][:7])
-    assert all(valid[7500:8000]) and all(valid[-4000:])
+
+    found, _ = rebooted(kit.declared("vsa-ii"), samples, {0: begun, 1000: 0.1, 8000: 2.7}, second, look)
+    assert all(found.valid[7500:8000]) and all(found.valid[-4000:])
     assert said == {"motor 2"}
 
 
 def test_what_few_blocks_between_two_reboots_say_of_a_constant_torque_is_not_carried_over():
     """The zero was not where they took it to be, so the torque at it is none."""
-    motion, offs = kit.motion("quadratic", 10.0), {100: -0.06, 1100: 0.02}
-    estimator = kit.make_estimator(kit.declared("quadratic"), kit.EstimatorSettings(), kit.PERIOD_S)
-    rms, off, valid = np.sqrt(np.mean(motion.torque_nm**2)), 0.0, 0
-    for k, sample in enumerate(motion.samples):
-        if k in offs:
-            off = offs[k]
-            estimator.lose_zeros()
-        own, *others = sample.motor_position_rad
-        one = estimator.step(sample._replace(motor_position_rad=(own + off, *others)))
-        valid += one.status & 1
-        assert not one.status & 1 or abs(one.flexibility_torque_nm - motion.torque_nm[k]) < 0.25 * rms
-    assert valid > 1000
+    motion = kit.motion("quadratic", 10.0)
+    found, _ = rebooted(kit.declared("quadratic"), motion.samples, {100: -0.06, 1100: 0.02})
+    assert is_right(found, motion, found.valid) and np.sum(found.valid) > 1000
 
 
 def test_friction_is_found_anew_after_a_reboot():
     """A motion in one direction does not tell friction from where the zero of a straight spring is."""
     motion = kit.motion("constant", 24.0, seed=0)
-    estimator = kit.make_estimator(kit.declared("constant"), kit.EstimatorSettings(), kit.PERIOD_S)
-    rms, before = np.sqrt(np.mean(motion.torque_nm**2)), motion.samples[0].motor_position_rad[0]
-    for k, sample in enumerate(motion.samples):
-        direction = np.sign(sample.motor_position_rad[0] - before)
-        before = sample.motor_position_rad[0]
-        if k == 12000:
-            estimator.lose_zeros()
-        if k < 12000:
-            torque = sample.motor_torque_nm[0] + 0.3 * rms * direction
-            sample = sample._replace(motor_torque_nm=(torque, *sample.motor_torque_nm[1:]))
-        one = estimator.step(sample)
-        if k >= 12000 and one.status & kit.VALID:
-            assert abs(one.flexibility_torque_nm - motion.torque_nm[k]) < 0.25 * rms, k
-    assert one.status & kit.VALID
+    friction = 0.3 * np.sqrt(np.mean(motion.torque_nm**2))
+    before = np.array([sample.motor_position_rad[0] for sample in motion.samples[:12000]])
+    torques = friction * np.sign(np.diff(before, prepend=before[0]))
+    rubbing = [
+        sample._replace(motor_torque_nm=(sample.motor_torque_nm[0] + more, *sample.motor_torque_nm[1:]))
+        for sample, more in zip(motion.samples, torques, strict=False)
+    ]
+    found, _ = rebooted(kit.declared("constant"), rubbing + motion.samples[12000:], {12000: 0.0})
+    assert is_right(found, motion, found.valid, 12000) and found.valid[-1]
 
 
 def test_a_zero_that_was_only_guessed_is_no_measure_of_the_next_one():
     """The first reboot is at a time at which nothing is known: the zero is taken to be the declared one."""
-    joint, offs, off = load(QUADRATIC), {400: 0.1876, 4400: -0.0625}, 0.0
+    joint = load(QUADRATIC)
     motion = kit.moved(record(world_from_joint(joint, seed=1), 20.0))
-    estimator = kit.make_estimator(joint.model(), joint.estimator, joint.bus.period_s)
-    rms = np.sqrt(np.mean(motion.torque_nm**2))
-    for k, sample in enumerate(motion.samples):
-        if k in offs:
-            off = offs[k]
-            estimator.lose_zeros()
-        one = estimator.step(sample._replace(link_position_rad=sample.link_position_rad + off))
-        wrong = abs(one.flexibility_torque_nm - motion.torque_nm[k]) > 0.25 * rms
-        assert not wrong or not one.status & (kit.VALID | int(Status.TORQUE_VALID))
-    assert one.status & kit.VALID
+    found, _ = rebooted(joint.model(), motion.samples, {400: 0.1876, 4400: -0.0625}, link)
+    assert is_right(found, motion, found.torque_valid) and found.valid[-1]
 
 
 @mostly_slow(("name", "after"), ("constant", 840), ("quadratic", 880), ("constant", 920))
 def test_a_doubted_sample_in_the_middle_of_that_judgement_does_not_end_it(name, after):
     """The half block before a sample whose moment is in doubt is not judged as a whole one."""
     motion = kit.motion(name, 14.0)
-    valid, _, torque = np.array(list(rebooted(motion, name, 0.1, after)))[LOST:].T
-    off = np.abs(torque - motion.torque_nm[LOST:])[valid > 0]
-    assert len(off) and max(off) < 0.25 * np.sqrt(np.mean(motion.torque_nm**2))
+    doubt = lambda k, estimator: k == LOST + after - 1 and estimator.distrust()  # noqa: E731
+    found, _ = rebooted(kit.declared(name), motion.samples, {LOST: 0.1}, look=doubt)
+    assert is_right(found, motion, found.valid, LOST)
 
 
 def moves_with_rests(seconds, seed):

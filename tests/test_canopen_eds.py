@@ -128,16 +128,6 @@ def test_every_makers_file_loads_and_ours_without_a_word(path):
     assert found.objects[0x6064, 0].data_type == datatypes.INTEGER32
 
 
-@needs_real
-def test_the_known_faults_of_makers_files_are_named():
-    problems = {path.name: " ".join(load_eds(path, 5).problems) for path in REAL}
-    assert "cp1252" in problems["faulhaber_605.3150.71.eds"]
-    assert "twice" in problems["infranor_Easy-ak.eds"]
-    assert "of node 1" in problems["maxon_EPOS4_50_15.dcf"]
-    assert "of node 32" in problems["e35.eds"]
-    assert "unknown data type" in problems["kollmorgen_RGM.eds"]
-
-
 STATED = "counts_per_rev = 4096\nrated_torque_nm = 1.0\nvelocity_rad_s_per_count = 0.001"
 
 

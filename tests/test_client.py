@@ -339,13 +339,3 @@ def test_a_daemon_that_is_there_is_listed_and_not_missed(
     assert "drivelink run JOINT starts a daemon" in capsys.readouterr().err
     assert cli.main(["list", "--endpoint", endpoint, "--prefix", "other"]) == 6
     assert "no joint of prefix 'other' at" in capsys.readouterr().err
-
-
-def test_the_age_does_not_believe_the_senders_clock(publisher, joint):
-    """Stamps an hour ahead, or all the same: the age is still that on the local clock."""
-    for stamp_ns in (time.time_ns() + 3_600_000_000_000, 5, 5, 5):
-        before = time.monotonic()
-        joint.latest()  # the queue is seen empty now
-        put_estimate(publisher, make_estimate(stamp_ns % 7), stamp_ns)
-        assert joint.wait(LIMIT_S) is not None
-        assert 0.0 <= joint.age_s <= time.monotonic() - before

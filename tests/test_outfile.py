@@ -74,16 +74,6 @@ def test_the_disk_has_the_file_before_its_name_and_the_folder_after(folder, monk
     assert done == ["file", "name", "folder"]
 
 
-@pytest.mark.parametrize("linked", [lambda a, b: b.symlink_to(a), lambda a, b: os.link(a, b)])
-def test_an_input_is_known_by_its_links(folder, linked):
-    recording, other = folder / "r.csv", folder / "other.csv"
-    recording.write_text("data")
-    linked(recording, other)
-    for force in (False, True):
-        with pytest.raises(UsageError, match="is read here and must not be replaced"):
-            check_target(other, [recording], force=force)
-
-
 def test_a_write_protected_file_is_not_replaced(folder):
     path = folder / "a.txt"
     path.write_text("kept")

@@ -1,7 +1,6 @@
 """The joint of eqs 4-7: laws, equations, integration."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -82,20 +81,6 @@ def test_damped_motor_comes_to_the_closed_form_speed():
     state = run(plant, [0.0] * 4, 1.0, 0.001, 2.0)
     assert state[3] == pytest.approx(4.0 * -math.expm1(-1.0), rel=1e-12)
     assert state[:2] == state[2:]
-
-
-@pytest.mark.parametrize("motors", [1, 2])
-def test_integration_converges_with_order_four(motors):
-    plant = sea(HARDENING, motors=motors)
-    start = [0.4, 0.0, 0.3, 0.0, 0.35, 0.0][: 2 + 2 * motors]
-
-    def end(steps):
-        return np.array(run(plant, list(start), 0.5, 0.5 / steps, 3.0))
-
-    exact = end(4000)
-    errors = [np.linalg.norm(end(steps) - exact) for steps in (100, 200, 400)]
-    for coarse, fine in pairwise(errors):
-        assert 13.0 < coarse / fine < 20.0  # 2^4, with the next order's remainder
 
 
 @pytest.mark.parametrize(

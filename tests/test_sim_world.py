@@ -176,32 +176,24 @@ def recorded(drive, encoder=PERFECT_ENCODER, **kwargs):
     return record(World(sea(), (drive,), encoder, excitation=build(EXCITATION, 1), **kwargs), 3.0)
 
 
-def test_positions_are_whole_counts_of_the_motor_shaft():
+COUNT, RPM, NM_A = 2.0 * math.pi / (4096 * 50), 2.0 * math.pi / 60.0 / 50.0, 0.05 * 50.0
+
+
+def test_a_drive_reads_counts_of_its_shaft_whole_rpm_and_per_mille_of_its_rated_current():
     r = recorded(DRIVE)
-    step = 2.0 * math.pi / (4096 * 50)
-    counts = r["motor1_position_rad"] / step
-    assert counts == pytest.approx(np.round(counts), abs=1e-6)
-    error = r["motor1_position_rad"] - r["truth_motor1_position_rad"]
-    assert np.abs(error).max() <= step / 2 * (1 + 1e-9)
-    assert np.std(error) == pytest.approx(step / math.sqrt(12.0), rel=0.05)  # uniform within a count
-
-
-def test_velocity_comes_in_whole_revolutions_per_minute():
-    r = recorded(DRIVE)
-    rpm = r["motor1_velocity_rad_s"] * 50.0 * 60.0 / (2.0 * math.pi)
-    assert rpm == pytest.approx(np.round(rpm), abs=1e-9)
-    assert np.abs(r["motor1_velocity_rad_s"] - r["truth_motor1_velocity_rad_s"]).max() < 0.11 / 50.0
-
-
-def test_current_is_noisy_and_comes_in_per_mille_of_the_rated_current():
-    r = recorded(DRIVE)
-    permille = r["motor1_current_a"] / 0.004
-    assert permille == pytest.approx(np.round(permille), abs=1e-6)
-    error = r["motor1_torque_nm"] - r["truth_motor1_torque_nm"]
-    per_ampere = 0.05 * 50.0
+    for name, step in (("position_rad", COUNT), ("velocity_rad_s", RPM), ("current_a", 0.004)):
+        whole = r[f"motor1_{name}"] / step
+        assert whole == pytest.approx(np.round(whole), abs=1e-6)
+    position, velocity, torque = (
+        r[f"motor1_{name}"] - r[f"truth_motor1_{name}"]
+        for name in ("position_rad", "velocity_rad_s", "torque_nm")
+    )
+    assert np.abs(position).max() <= COUNT / 2 * (1 + 1e-9)
+    assert np.std(position) == pytest.approx(COUNT / math.sqrt(12.0), rel=0.05)  # uniform within a count
+    assert np.abs(velocity).max() < 0.11 / 50.0
     # Noise of 10 mA and a step of 4 mA add as squares; 3000 draws give it to 1.3 %.
-    assert np.std(error) == pytest.approx(per_ampere * math.hypot(0.01, 0.004 / math.sqrt(12.0)), rel=0.05)
-    assert r["motor1_torque_nm"] == pytest.approx(r["motor1_current_a"] * per_ampere)
+    assert np.std(torque) == pytest.approx(NM_A * math.hypot(0.01, 0.004 / math.sqrt(12.0)), rel=0.05)
+    assert r["motor1_torque_nm"] == pytest.approx(r["motor1_current_a"] * NM_A)
 
 
 def test_directions_turn_what_is_reported_and_not_what_happens():

@@ -294,14 +294,24 @@ def joint_model(
     order: int | None = 2,
     m: int = 1,
     parameters: dict | None = None,
+    covariance: tuple[tuple[float, ...], ...] = (),
     effects: tuple[Effect, ...] = (),
+    motor: Mapping[str, Any] | None = None,
     **joint: Any,
 ) -> JointModel:
-    """One or two motors that are alike, on a link; `order` is a polynomial's, `joint` what else the model has."""
+    """One or two motors that are alike, on a link; `order` is a polynomial's, `motor` and `joint` what else they have."""
     order = order if model == "polynomial" else None
-    transmission = Transmission(model=model, order=order, parameters=parameters or {})
-    motor = Motor(inertia_kg_m2=B, viscous_damping_nm_s_rad=D, transmission=transmission, effects=effects)
-    return JointModel(arrangement="single" if m == 1 else "antagonistic", motors=(motor,) * m, **joint)
+    how = {} if not covariance else {"covariance": covariance}
+    transmission = Transmission(model=model, order=order, parameters=parameters or {}, **how)
+    made = Motor(
+        inertia_kg_m2=B, viscous_damping_nm_s_rad=D, transmission=transmission, effects=effects, **(motor or {})
+    )
+    return JointModel(arrangement="single" if m == 1 else "antagonistic", motors=(made,) * m, **joint)
+
+
+def with_motor(model: JointModel, **changes: Any) -> JointModel:
+    """The model whose first motor is another one in these."""
+    return replace(model, motors=(replace(model.motors[0], **changes), *model.motors[1:]))
 
 
 def estimates(model: JointModel, record: Record, **settings: Any) -> Array:

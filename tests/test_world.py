@@ -15,10 +15,8 @@ from estimator import (
     EstimatorSettings,
     JointModel,
     LinkDynamics,
-    Motor,
     Record,
     Status,
-    Transmission,
     fit,
     make_estimator,
 )
@@ -39,9 +37,8 @@ def simulated(settings: str):
     return simulate(**{name: float(text) if name == "period" else text for name, text in given.items()})
 
 
-def played(record: Record, motor: Motor):
+def played(record: Record, model: JointModel):
     """(estimator, stiffness, its standard deviation, whether it is valid)."""
-    model = JointModel(arrangement="single", motors=(motor,))
     estimator = make_estimator(model, EstimatorSettings(), record.period_s)
     said = [
         (one.stiffness_nm_rad, one.stiffness_std_nm_rad, int(one.status) & Status.VALID)
@@ -123,12 +120,8 @@ def test_a_hand_that_moves_a_healthy_joint_shows_no_other_inertia():
         "motion=hand-guided size=8 push=4.42 seed=5121 seconds=20 stiffness=124.45 inertia=0.2483 damping=0.93 "
         "link_inertia=0.89 link_damping=0.058 gravity=0 link_delay=0.0007 motor_counts=65536 link_bits=18"
     )
-    record = simulated(settings).record
-    motor = Motor(
-        inertia_kg_m2=0.2483, viscous_damping_nm_s_rad=0.93, inertia_std_relative=1e-4,
-        transmission=Transmission(model="linear", parameters={"k_nm_rad": 124.45}),
-    )  # fmt: skip
-    found = diagnose(record, JointModel(arrangement="single", motors=(motor,)))
+    spring, sure = {"model": "linear", "parameters": {"k_nm_rad": 124.45}}, {"inertia_std_relative": 1e-4}
+    found = diagnose(simulated(settings).record, joints.joint_model(0.2483, 0.93, **spring, motor=sure))
     assert found.verdict == "sufficient", found.effects
 
 
@@ -136,12 +129,7 @@ def test_the_interval_holds_what_the_shape_of_an_undeclared_effect_may_be_off():
     """A gear's losses are nearly, not quite, of the shape that the estimator has for them."""
     settings = "spring=cubic stiffness=120 cubic=3600 gear_loss=0.05 seconds=20 size=7.2 link_bits=18"
     record, truth, _ = simulated(settings)
-    motor = Motor(
-        inertia_kg_m2=0.12,
-        viscous_damping_nm_s_rad=0.8,
-        transmission=Transmission(model="polynomial", order=2),
-    )
-    estimator, stiffness, std, valid = played(record, motor)
+    estimator, stiffness, std, valid = played(record, joints.joint_model(0.12, 0.8))
     off = np.abs(stiffness - truth)[valid]
     assert "load_dependent_friction" in estimator.undeclared()[0] and np.mean(valid) > 0.8
     assert np.mean(off < 1.96 * std[valid]) > 0.95
@@ -153,26 +141,20 @@ def test_a_stiff_joint_that_moves_fast_is_not_taken_for_a_soft_one_with_a_late_l
         "stiffness=7.6e6 inertia=420 damping=1700 link_inertia=310 link_damping=520 gravity=700 period=0.004 size=3700 "
         "motion=pushes push=1850 seconds=12 seed=3 motor_counts=819200 link_bits=21 torque_noise=20 link_delay=0.012"
     )
-    record = simulated(settings).record
-    elastic = Transmission(model="polynomial", order=2)
-    motor = Motor(inertia_kg_m2=420.0, viscous_damping_nm_s_rad=1700.0, transmission=elastic)
-    _, stiffness, _, valid = played(record, motor)
+    _, stiffness, _, valid = played(simulated(settings).record, joints.joint_model(420.0, 1700.0))
     # Noise of the encoders leaves a percent; a spring that holds the delay has a fiftieth of it.
     assert np.all(np.abs(stiffness[-250:] / 7.6e6 - 1.0) < 0.05)
     assert np.all(np.abs(stiffness[valid] / 7.6e6 - 1.0) < 0.2)
 
 
 HELD = "spring=cubic stiffness=120 cubic=3600 seconds=12 size=7 link_bits=17"
-ELASTIC = Motor(
-    inertia_kg_m2=0.12, viscous_damping_nm_s_rad=0.8, transmission=Transmission(model="polynomial", order=2)
-)
 
 
 @pytest.mark.parametrize("dynamics", [None, LinkDynamics(inertia_kg_m2=0.4, gravity_nm=3.0)])
 def test_a_link_that_is_held_shows_the_spring_and_nothing_of_the_link(dynamics):
     record = simulated(f"{HELD} link_inertia=1e7 gravity=0").record
     assert len(np.unique(record.link_position_rad)) < 4
-    joint = JointModel(arrangement="single", motors=(ELASTIC,), link=dynamics)
+    joint = joints.joint_model(0.12, 0.8, link=dynamics)
     (found,) = fit(record, joint)
     assert np.all(np.abs(found.alpha - [120.0, 3600.0]) < 3.0 * np.sqrt(np.diag(found.covariance)))
     assert diagnose(record, joint).verdict == "sufficient"
@@ -181,10 +163,9 @@ def test_a_link_that_is_held_shows_the_spring_and_nothing_of_the_link(dynamics):
 def test_a_link_encoder_that_is_silent_shows_no_spring():
     moving = simulated(f"{HELD} gravity=3").record
     silent = replace(moving, link_position_rad=np.full(len(moving), 0.3))
-    (found,) = fit(silent, JointModel(arrangement="single", motors=(ELASTIC,)))
+    (found,) = fit(silent, joints.joint_model(0.12, 0.8))
     assert not found.parameters
-    spring = Transmission(model="linear", parameters={"k_nm_rad": 120.0})
-    joint = JointModel(arrangement="single", motors=(replace(ELASTIC, transmission=spring),))
+    joint = joints.joint_model(0.12, 0.8, model="linear", parameters={"k_nm_rad": 120.0})
     with pytest.raises(EstimatorError, match="expected a run without gaps"):
         free_run(joints.part(silent, slice(1)), joint)  # one sample neither moves nor stands
 
@@ -195,18 +176,13 @@ STIFF = "stiffness=15000 inertia=1.2 damping=8 link_inertia=4 link_damping=3 mot
 def declared(settings: str, **spring: object) -> JointModel:
     """The joint that these settings make, as its file would declare it."""
     given = {name: float(x) for name, x in (one.split("=") for one in settings.split()) if name != "motion"}
-    own = {"model": "linear", "parameters": {"k_nm_rad": given["stiffness"]}} | spring
-    motor = Motor(
-        inertia_kg_m2=given["inertia"],
-        viscous_damping_nm_s_rad=given["damping"],
-        transmission=Transmission(**own),
-    )
+    own = {"model": "linear", "parameters": {"k_nm_rad": given["stiffness"]}, "order": None} | spring
     link = LinkDynamics(
         inertia_kg_m2=given["link_inertia"],
         viscous_damping_nm_s_rad=given["link_damping"],
         gravity_nm=given["gravity"],
     )
-    return JointModel(arrangement="single", motors=(motor,), link=link)
+    return joints.joint_model(given["inertia"], given["damping"], **own, link=link)
 
 
 @pytest.mark.slow
@@ -248,22 +224,12 @@ def test_a_motor_that_sticks_where_it_turns_is_no_late_torque():
         f"stiffness=50 inertia=0.015 damping=0.065 link_inertia=0.07 link_damping=0.016 gravity=1.1 {COARSE}"
     )
     world = simulated(f"{joint} friction=coulomb coulomb=0.15 size=2 top_hz=4 seconds=14 period=0.002 seed=3")
-    spring = Transmission(order=1, parameters={"coefficients_nm_rad": (50.0,)}, covariance=((0.07,),))
+    spring = {"order": 1, "parameters": {"coefficients_nm_rad": (50.0,)}, "covariance": ((0.07,),)}
     friction = Effect(name="coulomb_friction", parameters={"torque_nm": 0.15, "smoothing_rad_s": 0.004})
-    motor = Motor(
-        inertia_kg_m2=0.015,
-        viscous_damping_nm_s_rad=0.052,
-        transmission=spring,
-        effects=(friction,),
-        fit_rms_nm=(0.015, 1.06),
-    )
-    model = JointModel(arrangement="single", motors=(motor,))
-    estimator = make_estimator(model, EstimatorSettings(), world.record.period_s)
-    said = [
-        (one.flexibility_torque_nm, int(one.status)) for one in map(estimator.step, world.record.samples())
-    ]
-    torque, status = np.array(said).T
-    valid = status.astype(int) & Status.TORQUE_VALID > 0
+    fitted = {"fit_rms_nm": (0.015, 1.06)}
+    model = joints.joint_model(0.015, 0.052, **spring, effects=(friction,), motor=fitted)
+    said = joints.estimates(model, world.record)
+    torque, valid = said[:, 2], said[:, 1].astype(int) & Status.TORQUE_VALID > 0
     truth = world.columns["true_flexibility_torque_nm"]
     assert np.mean(valid) > 0.9
     assert np.max(np.abs(torque - truth)[valid]) < 0.1 * np.std(truth)
@@ -273,7 +239,6 @@ def test_a_motor_that_sticks_where_it_turns_is_not_fitted_by_delays():
     joint = "stiffness=580 inertia=0.072 damping=0.46 link_inertia=0.56 link_damping=0.05 gravity=1"
     read = "motor_counts=131072 link_bits=17 torque_noise=0.017 seconds=14 seed=2"
     record = simulated(f"{joint} friction=coulomb coulomb=0.21 size=5 top_hz=4 {read}").record
-    motor = Motor(inertia_kg_m2=0.072, viscous_damping_nm_s_rad=0.46)
-    (found,) = fit(record, JointModel(arrangement="single", motors=(motor,)))
+    (found,) = fit(record, joints.joint_model(0.072, 0.46, order=None))
     assert (found.torque_delay_s, found.link_delay_s) == (0.0, 0.0)
     assert found.viscous_damping_nm_s_rad == pytest.approx(0.46, rel=0.02)

@@ -110,9 +110,7 @@ def test_an_effect_is_no_delay_of_a_reading_and_in_the_interval_of_the_damping(l
 def test_no_shape_is_stated_that_the_law_does_not_have():
     """A constant spring declared as a VSA-II's: no joint file holds the shape that fits it."""
     (record,) = kit.World([{"hysteresis_nm": 0.6, "hysteresis_rad": 0.01}]).run()
-    (motor,) = kit.model().motors
-    vsa = replace(motor, transmission=replace(motor.transmission, model="vsa-ii"))
-    found = diagnose(record, replace(kit.model(), motors=(vsa,)))
+    found = diagnose(record, joints.with_motor(kit.model(), transmission=Transmission(model="vsa-ii")))
     assert not found.transmissions[0].parameters
     assert any("leaves the range that the law has" in note for note in found.notes)
 
@@ -144,9 +142,9 @@ def test_where_a_torque_rests_on_its_limit_more_may_have_acted():
 def test_the_zero_of_a_spring_that_bends_is_found_before_it_is_judged(order):
     """Far from it a straight line through the spring promises more than there is."""
     (record,) = kit.World([{"bend_nm_rad2": 3000.0, "zero_rad": 0.02}]).run()
-    (motor,) = kit.model(linked=False).motors
-    own = replace(motor, transmission=Transmission(model="polynomial", order=order))
-    fitted = Problem([record], replace(kit.model(linked=False), motors=(own,)), 15.0).null()
+    spring = Transmission(model="polynomial", order=order)
+    model = joints.with_motor(kit.model(linked=False), transmission=spring)
+    fitted = Problem([record], model, 15.0).null()
     assert fitted.total("everyday", "deflection_offset", 0, run=0)[0] == pytest.approx(0.02, abs=3e-4)
 
 
@@ -172,19 +170,16 @@ def test_a_declared_friction_errs_as_one_that_is_found():
     """Its sign changes over another velocity than declared: a healthy joint "lacked" an encoder's delay."""
     (record,) = kit.World([{"coulomb_nm": 2.0}], seconds=8.0).run()
     friction = Effect(name="coulomb_friction", parameters={"torque_nm": 2.0, "smoothing_rad_s": 0.03})
-    exact = kit.model(linked=False)
-    found = diagnose(record, replace(exact, motors=(replace(exact.motors[0], effects=(friction,)),)))
+    found = diagnose(record, joints.with_motor(kit.model(linked=False), effects=(friction,)))
     assert found.verdict == "sufficient"
 
 
 def test_an_inertia_moves_as_far_as_it_is_declared_unsure():
     """Twenty per cent too much, declared unsure and declared as certain."""
     (record,) = kit.World([{}]).run()
-    exact = kit.model(linked=False)
-    heavy = replace(exact.motors[0], inertia_kg_m2=1.2 * kit.INERTIA)
-    found = {}
+    exact, found = kit.model(linked=False), {}
     for std in (0.5, 1e-5):
-        declared = replace(exact, motors=(replace(heavy, inertia_std_relative=std),))
+        declared = joints.with_motor(exact, inertia_kg_m2=1.2 * kit.INERTIA, inertia_std_relative=std)
         (found[std],) = Problem([record], declared, BANDWIDTH_HZ).null().total("everyday", "motor_inertia", 0)
     assert found[0.5] == pytest.approx(-0.2 * kit.INERTIA, rel=0.02)
     assert abs(found[1e-5]) < 0.02 * kit.INERTIA

@@ -271,12 +271,8 @@ def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
 def test_a_law_moves_half_of_the_way_to_a_bound_of_its_shape_and_its_torque_as_far():
     """Beside a shape that stopped half way a stiffness went all the way: a VSA-II ended at 10 MN·m/rad."""
     (record,) = kit.World([{}], seconds=5.0).run()
-    (motor,) = kit.model(linked=False).motors
-    own, law = replace(motor, transmission=Transmission(model="vsa-ii")), MODELS["vsa-ii"]
-    frame, begin = (
-        Problem([record], replace(kit.model(), motors=(own,)), 15.0).frames[0],
-        np.array([100.0, 1.5]),
-    )
+    model, law = joints.with_motor(kit.model(), transmission=Transmission(model="vsa-ii")), MODELS["vsa-ii"]
+    frame, begin = Problem([record], model, 15.0).frames[0], np.array([100.0, 1.5])
     phi = np.sqrt(np.mean(frame.motors[0].deflection ** 2, keepdims=True))
     for step, share in (([10.0, 0.1], 1.0), ([10.0, 1.5], 0.5), ([10.0, -1.0], 0.25)):
         (alpha,) = Base((begin,)).moved(frame, np.array(step)).alpha
@@ -310,20 +306,17 @@ def test_a_number_is_no_effect_within_the_deviation_that_the_joint_file_knows(kn
 @pytest.mark.parametrize(("std_nm", "verdict"), [(0.04, "sufficient"), (None, "effect")])
 @pytest.mark.parametrize("more_nm", [0.06, -0.06])
 def test_an_effect_that_was_fitted_may_be_off_by_its_deviation(std_nm, verdict, more_nm):
-    (record,), model = kit.World([{"coulomb_nm": 0.5 + more_nm}]).run(), kit.model()
-    (motor,) = model.motors
+    (record,) = kit.World([{"coulomb_nm": 0.5 + more_nm}]).run()
     std = {} if std_nm is None else {"torque_nm": std_nm}
     level = {"torque_nm": 0.5, "smoothing_rad_s": 0.002}
     friction = Effect(name="coulomb_friction", parameters=level, std=std)
-    found = diagnose(record, replace(model, motors=(replace(motor, effects=(friction,)),)))
-    assert found.verdict == verdict
+    assert diagnose(record, joints.with_motor(kit.model(), effects=(friction,))).verdict == verdict
 
 
 def test_a_zero_of_the_encoders_is_within_what_they_read_beside_a_spring_of_no_stiffness():
     (record,) = kit.World([{}], seconds=5.0).run()
-    (motor,) = kit.model(linked=False).motors
-    own = replace(motor, transmission=Transmission(model="exponential"))
-    problem = Problem([record], replace(kit.model(), motors=(own,)), 15.0)
+    model = joints.with_motor(kit.model(), transmission=Transmission(model="exponential"))
+    problem = Problem([record], model, 15.0)
     null = problem.null()
     zero = Term(Candidate(LIBRARY["deflection_offset"], 0), {})
     soft = Base((np.array([7e-15, 0.15]),))

@@ -13,6 +13,7 @@ from estimator.diagnosis.candidates import Candidate, grid
 from estimator.diagnosis.frame import Corrections, Frame, Signals
 from estimator.effects import LIBRARY
 from estimator.identify import identify
+from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
 INERTIA, DAMPING, FRICTION, T, SECONDS = 0.08, 0.5, 0.4, 0.004, 20.0
@@ -55,23 +56,23 @@ def test_declared_friction_that_says_nothing_of_its_smoothing_holds_the_motor_at
     assert fitted.parameters["smoothing_rad_s"] == friction.parameters["smoothing_rad_s"]
 
 
-def test_a_smoothing_that_is_declared_stays():
+def smoothed(smoothing_rad_s: float) -> JointModel:
+    """The joint, which says something of its friction's smoothing."""
     model = JOINT.model()
-    (motor,) = model.motors
-    (friction,) = motor.effects
-    told = replace(friction, parameters={**friction.parameters, "smoothing_rad_s": 0.02})
-    found = diagnose(moves(0), replace(model, motors=(replace(motor, effects=(told,)),)))
-    assert found.smoothing_rad_s is None
+    ((friction,),) = (motor.effects for motor in model.motors)
+    told = replace(friction, parameters={**friction.parameters, "smoothing_rad_s": smoothing_rad_s})
+    return joints.with_motor(model, effects=(told,))
+
+
+def test_a_smoothing_that_is_declared_stays():
+    assert diagnose(moves(0), smoothed(0.02)).smoothing_rad_s is None
 
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("smoothing_rad_s", [0.002, 0.004])
 def test_what_declared_friction_may_hold_at_rest_is_no_missing_effect(seed, smoothing_rad_s):
     """A smoothing of another recording's fit: the rests of this one lacked "Stribeck friction", certain."""
-    (motor,) = JOINT.model().motors
-    (friction,) = motor.effects
-    told = replace(friction, parameters={**friction.parameters, "smoothing_rad_s": smoothing_rad_s})
-    model = replace(JOINT.model(), motors=(replace(motor, effects=(told,)),))
+    model = smoothed(smoothing_rad_s)
     found = diagnose(moves(seed), model)
     assert (found.verdict, found.effects) == ("sufficient", ())
     assert found.validation.before_relative > 0.05  # what is left is said

@@ -134,15 +134,14 @@ def test_fit_widens_by_what_each_recording_shows_when_left_out(model):
 
 def test_the_residual_baseline_expects_the_error_of_other_data(model):
     known = Transmission(model="linear", parameters={"k_nm_rad": SOFT})
-    model = replace(model, motors=(replace(model.motors[0], transmission=known),))
+    model = joints.with_motor(model, transmission=known)
     once, twice = (measure_baseline(record(SOFT), model, surplus) for surplus in (1.0, 4.0))
     assert twice.residual_nm[0] == pytest.approx(2.0 * once.residual_nm[0])
     assert twice.log_std == once.log_std
 
 
 def test_errors_beyond_the_residual_widen_what_the_data_tell_not_what_is_declared(model):
-    certain = replace(model, motors=(replace(model.motors[0], inertia_std_relative=1e-6),))
-    problem = Problem([record(SOFT)], certain, BANDWIDTH_HZ)
+    problem = Problem([record(SOFT)], joints.with_motor(model, inertia_std_relative=1e-6), BANDWIDTH_HZ)
     fitted = problem.null()
     (inertia,) = (j for j, slot in enumerate(fitted.slots) if slot.name == "motor_inertia")
     before, after = (np.diag(hac_covariance(problem, fitted, surplus)) for surplus in (1.0, 4.0))
@@ -176,11 +175,10 @@ def test_a_scale_and_a_part_of_a_ripple_are_told_apart_by_a_whole_turn(amplitude
 
 def sprung(share: float, link: float = 1.0, **more: object) -> JointModel:
     """The joint with a spring, and a link's inertia, of so many times the true one."""
-    known = kit.model()
     law = Transmission(model="linear", parameters={"k_nm_rad": share * kit.STIFFNESS}, **more)
+    known = joints.with_motor(kit.model(), transmission=law)
     assert known.link is not None
-    heavier = replace(known.link, inertia_kg_m2=link * kit.LINK_INERTIA)
-    return replace(known, motors=(replace(known.motors[0], transmission=law),), link=heavier)
+    return replace(known, link=replace(known.link, inertia_kg_m2=link * kit.LINK_INERTIA))
 
 
 SURE = {"covariance": ((0.01,),)}  # data do not move it
@@ -313,20 +311,17 @@ def test_an_inertia_of_zero_is_none_that_was_found(healthy):
 
 @pytest.mark.parametrize("linked", [True, False])
 def test_a_damping_that_nobody_declared_is_no_anchor_at_zero(healthy, linked):
-    record, known = healthy, kit.model(linked=linked)
-    motor = replace(known.motors[0], viscous_damping_nm_s_rad=0.0)
-    (fitted,) = identify(record, replace(known, motors=(motor,))).fits
+    undamped = joints.with_motor(kit.model(linked=linked), viscous_damping_nm_s_rad=0.0)
+    (fitted,) = identify(healthy, undamped).fits
     error = abs(fitted.viscous_damping_nm_s_rad - kit.DAMPING)
     assert error < max(3.0 * fitted.nuisance_std["damping"], 0.02 * kit.DAMPING)
     assert fitted.nuisance_std["damping"] < 0.1 * kit.DAMPING
 
 
 def test_a_deflection_that_a_law_cannot_have_is_an_error_that_says_so(healthy):
-    record, linear = healthy, kit.model()
-    own = replace(linear.motors[0], transmission=Transmission(model="vsa-ii"))
-    far = replace(record, motor_position_rad=1e6 * record.motor_position_rad)
+    far = replace(healthy, motor_position_rad=1e6 * healthy.motor_position_rad)
     with pytest.raises(EstimatorError, match="more than a transmission of model"):
-        identify(far, replace(linear, motors=(own,)))
+        identify(far, joints.with_motor(kit.model(), transmission=Transmission(model="vsa-ii")))
 
 
 def test_what_is_quoted_is_what_was_judged():

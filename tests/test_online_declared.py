@@ -4,7 +4,6 @@
 which an error hardly changes are one draw.
 """
 
-from dataclasses import replace
 from functools import lru_cache
 
 import joints
@@ -172,9 +171,8 @@ def test_a_spring_behind_an_uneven_gear_is_deflected_by_its_error_too():
     """Torque and stiffness at the deflection that is read were 5 % and 1 % off."""
     uneven = {"sin_rad": 0.003, "cos_rad": 0.003, "periods_per_rev": 8.0}
     motion = kit.motion("quadratic", 12.0, effects=[make("kinematic_error", uneven, 0)])
-    joint = kit.declared("quadratic")
     known = Effect(name="kinematic_error", parameters=uneven)
-    joint = replace(joint, motors=(replace(joint.motors[0], effects=(known,)),))
+    joint = joints.with_motor(kit.declared("quadratic"), effects=(known,))
     estimates, _ = kit.play(joint, motion.samples)
     late = slice(6000, None)
     assert np.mean(estimates.valid[late]) > 0.99
@@ -195,9 +193,7 @@ def test_a_spring_behind_an_uneven_gear_is_deflected_by_its_error_too():
 def test_declared_friction_leaves_the_spring_what_it_is(name, parameters):
     """Formed of a sample before and believed while its sign changed, it made the stiffness 1 % and the torque 3 % off."""
     motion = kit.motion("constant", 16.0, seed=1, effects=[make(name, parameters, 0)])
-    joint = kit.declared("constant")
-    known = Effect(name=name, parameters=parameters)
-    joint = replace(joint, motors=(replace(joint.motors[0], effects=(known,)),))
+    joint = joints.with_motor(kit.declared("constant"), effects=(Effect(name=name, parameters=parameters),))
     estimates, _ = kit.play(joint, motion.samples)
     late = slice(6000, None)
     assert np.all(estimates.valid[late]) and not np.any(estimates.status & int(Status.CHANGED))

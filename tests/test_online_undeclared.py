@@ -186,19 +186,15 @@ def with_zero_moved(name, seed, off_rad):
 @pytest.mark.parametrize(
     ("name", "seed", "off_rad"),
     [
-        *(
-            ("constant", 1, 0.0258),
-            ("constant", 4, 0.1641),
-            ("quadratic", 5, -0.3109),
-            ("quadratic", 5, -3.5073),
-        ),
-        *(
-            ("quadratic", 1, -0.1),
-            ("quadratic", 3, -1.0),
-            ("vsa-ii", 0, 0.5),
-            ("vsa-ii", 0, 0.7),
-            ("vsa-ii", 2, -1.1),
-        ),
+        ("constant", 1, 0.0258),
+        ("constant", 4, 0.1641),
+        ("quadratic", 5, -0.3109),
+        ("quadratic", 5, -3.5073),
+        ("quadratic", 1, -0.1),
+        ("quadratic", 3, -1.0),
+        ("vsa-ii", 0, 0.5),
+        ("vsa-ii", 0, 0.7),
+        ("vsa-ii", 2, -1.1),
     ],
 )
 def test_a_zero_elsewhere_from_the_start_is_found_or_its_torque_not_believed(name, seed, off_rad):
@@ -249,8 +245,7 @@ def test_friction_of_the_load_is_no_change(name, effect, parameters, declared):
     moved = kit.motion(name, 16.0, seed=1, effects=[make(effect, parameters, 0)])
     joint = kit.declared(name)
     if declared:
-        known = Effect(name=effect, parameters=parameters)
-        joint = replace(joint, motors=(replace(joint.motors[0], effects=(known,)),))
+        joint = joints.with_motor(joint, effects=(Effect(name=effect, parameters=parameters),))
     estimates, estimator = kit.play(joint, moved.samples)
     assert ("load_dependent_friction" in estimator.undeclared()[0]) == (not declared)
     assert not np.any(estimates.status & Status.CHANGED)
@@ -276,7 +271,7 @@ def test_friction_at_rest_is_no_hysteresis(declared_nm):
     joint = joints.joint_model(0.12, 0.8, model="polynomial", order=2, parameters={})
     if declared_nm:
         friction = Effect(name="coulomb_friction", parameters={"torque_nm": declared_nm})
-        joint = replace(joint, motors=(replace(joint.motors[0], effects=(friction,)),))
+        joint = joints.with_motor(joint, effects=(friction,))
     estimates, estimator = kit.play(joint, record.samples())
     off = np.abs(estimates.stiffness_nm_rad / truth.sigma[:, 0, 0] - 1.0)
     assert estimator.undeclared()[0] == []

@@ -304,7 +304,11 @@ def joint_model(
     how = {} if not covariance else {"covariance": covariance}
     transmission = Transmission(model=model, order=order, parameters=parameters or {}, **how)
     made = Motor(
-        inertia_kg_m2=B, viscous_damping_nm_s_rad=D, transmission=transmission, effects=effects, **(motor or {})
+        inertia_kg_m2=B,
+        viscous_damping_nm_s_rad=D,
+        transmission=transmission,
+        effects=effects,
+        **(motor or {}),
     )
     return JointModel(arrangement="single" if m == 1 else "antagonistic", motors=(made,) * m, **joint)
 

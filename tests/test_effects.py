@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from estimator import (
-    Effect,
-    EstimatorError,
-    EstimatorSettings,
-    JointModel,
-    fit,
-    make_estimator,
-)
+from estimator import Effect, EstimatorError, EstimatorSettings, JointModel, fit, make_estimator
 from estimator.effects import LIBRARY, Coordinates, elements
 from estimator.filters import StateVariableFilter
 from estimator.sample import Sample

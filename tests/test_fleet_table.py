@@ -157,6 +157,15 @@ def night(joint: str, k: int, stiffness: float, effects: list[str]) -> dict[str,
     }  # fmt: skip
 
 
+def nights(count: int, changes: dict[int, dict[str, Any]] | None = None, **each: Any) -> list[dict[str, Any]]:
+    """Recordings of one joint that is steady, but for some nights."""
+    rows = (night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(count))
+    return [row | each | (changes or {}).get(k, {}) for k, row in enumerate(rows)]
+
+
+LOST = {"status": "error", "error": "no frames"}
+
+
 def sentence(*rows: dict[str, Any]) -> str:
     (joint,) = summarise([*rows], 0.05)["joints"]
     return str(joint["sentence"])
@@ -175,7 +184,7 @@ def test_joints_come_by_urgency_with_what_changed_since_when():
     assert json.loads(json.dumps(document)) == document
     joints = {one["joint"]: one for one in document["joints"]}
     assert [one["state"] for one in document["joints"]] == ["changing"] * 3 + ["steady"]
-    gone = night("steps", 20, 150.0, []) | {"status": "error", "error": "no frames"}
+    gone = night("steps", 20, 150.0, []) | LOST
     # What shows nothing any more comes before what changes.
     first = summarise([*rows, gone], 0.05)["joints"][0]
     assert (first["joint"], first["state"]) == ("steps", "lost") and "stepped by +" in first["sentence"]
@@ -272,10 +281,8 @@ def test_on_a_terminal_the_sentence_of_a_joint_breaks_between_words(tmp_path, mo
 
 
 def test_an_unusable_stiffness_is_no_point_of_the_trend_but_a_cross_on_the_chart():
-    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
-    rows[4] |= {"stiffness_middle_nm_rad": -20.0, "parameters": '{"k_nm_rad": -20.0}'}
-    rows[5]["excited"] = False
-    document = summarise(rows, 0.05)
+    negative = {"stiffness_middle_nm_rad": -20.0, "parameters": '{"k_nm_rad": -20.0}'}
+    document = summarise(nights(10, {4: negative, 5: {"excited": False}}), 0.05)
     (joint,) = document["joints"]
     assert len(joint["transmissions"][0]["series"]) == 8 and joint["state"] == "steady"
     assert [one["reason"] for one in joint["unusable"]] == [
@@ -285,11 +292,8 @@ def test_an_unusable_stiffness_is_no_point_of_the_trend_but_a_cross_on_the_chart
 
 
 def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_chart():
-    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
-    for k in (8, 9):
-        rows[k] |= {"excited": False, "effects": ["torque_offset@motor"], "error_before_relative": 1.34}
-    rows.append(night("elbow", 10, 150.0, []) | {"status": "error", "error": "no frames"})
-    document = summarise(rows, 0.05)
+    broken = {"excited": False, "effects": ["torque_offset@motor"], "error_before_relative": 1.34}
+    document = summarise(nights(11, {8: broken, 9: broken, 10: LOST}), 0.05)
     (joint,) = document["joints"]
     assert joint["state"] == "lost"
     assert joint["sentence"] == "The last 3 recordings show no stiffness, from 2026-01-13 on: no frames."
@@ -303,7 +307,7 @@ def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_cha
 def test_a_joint_that_breaks_is_still_said_to_lack_what_it_lacked():
     rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), ["coulomb_friction@motor"]) for k in range(8)]
     found = rows[-1]["sentence"]
-    rows.append(night("elbow", 8, 150.0, []) | {"status": "error", "error": "no frames"})
+    rows.append(night("elbow", 8, 150.0, []) | LOST)
     assert sentence(*rows).endswith(f"no frames. The last one that could be used says: {found}")
 
 
@@ -358,16 +362,13 @@ def test_what_no_run_writes_into_the_table_is_one_line(column, value, tmp_path, 
 
 
 def test_a_linear_axis_has_metres_and_newtons():
-    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) | {"axis": "linear"} for k in range(10)]
-    text = page(summarise(rows, 0.05))
+    text = page(summarise(nights(10, axis="linear"), 0.05))
     assert "at a deflection of 0.02 m, N/m; scatter" in text and "viscous damping, N·s/m<" in text
     assert "N·m" not in text and " rad" not in text
 
 
 def test_a_stiffness_that_says_nothing_at_the_common_deflection_is_no_point():
-    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
-    rows[4] |= {"covariance": [80.0**2]}
-    (joint,) = summarise(rows, 0.05)["joints"]
+    (joint,) = summarise(nights(10, {4: {"covariance": [80.0**2]}}), 0.05)["joints"]
     assert len(joint["transmissions"][0]["series"]) == 9
     assert [one["reason"] for one in joint["unusable"]] == ["its motion does not reveal the stiffness"]
 
@@ -378,7 +379,7 @@ def test_what_the_last_recordings_agree_on_is_said_with_the_day_since_which_they
         "effects": ["coulomb_friction@motor1"],
         "sentence": "The model lacks Coulomb friction.",
     }
-    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) | (found if k >= 9 else {}) for k in range(12)]
+    rows = nights(12, dict.fromkeys((9, 10, 11), found))
     last = "The last 3 of 12 recordings, since 2026-01-14, agree: The model lacks Coulomb friction."
     assert sentence(*rows) == last
     assert sentence(*rows[:10]).startswith("No significant change, but the last recording says: ")
@@ -386,10 +387,9 @@ def test_what_the_last_recordings_agree_on_is_said_with_the_day_since_which_they
 
 @pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
 def test_a_phone_shows_charts_and_tables_whole_and_joints_are_sorted_and_hidden(tmp_path):
-    rows = [
-        night("wrist", k, 150.0 + 4.0 * (k >= 12), ["coulomb_friction@motor"] if k >= 9 else [])
-        for k in range(20)
-    ] + [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(20)]
+    friction = ["coulomb_friction@motor"]
+    rows = [night("wrist", k, 150.0 + 4.0 * (k >= 12), friction if k >= 9 else []) for k in range(20)]
+    rows += nights(20)
     (tmp_path / "fleet.html").write_text(page(summarise(rows, 0.05)), encoding="utf-8")
     with chromium.Chromium(tmp_path / "profile") as browser:
         browser.resize(390, 800)

@@ -2,13 +2,18 @@
 
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
+from daemonkit import rig, vsa_text
 from simkit import TRANSCRIPTS, StubRig, play, wired
 
+from drivelink.canopen.layout import Signal
+from drivelink.jointfile import parse
+from estimator.sample import Status
 from sim.canopen.drive import Cia402Drive, StateMachine
 from sim.canopen.drive import PowerState as P
 from sim.canopen.encoder import Cia406Encoder
-from sim.canopen.profiles import profile
+from sim.canopen.profiles import PROFILES, profile
 from sim.sensors import LinkEncoder
 
 NO_OBJECT, NO_SUBINDEX, READ_ONLY = 0x06020000, 0x06090011, 0x06010002
@@ -189,3 +194,21 @@ def test_quick_stop_ends_disabled_or_stays_as_its_option_says():
         made.quick_stop_option = option
         made.step()
         assert made.state is (P.QUICK_STOP_ACTIVE if option >= 5 else P.SWITCH_ON_DISABLED), option
+
+
+@pytest.mark.parametrize("quirks", PROFILES)
+def test_every_makers_drive_is_configured_and_its_frames_decode(quirks):
+    text = vsa_text().replace("[motor.drive]", "[motor.drive]\ncounts_per_rev = 8192\nrated_current_a = 4.0")
+    with rig(parse(f'{text}quirks = "{quirks}"\n')) as made:
+        world, truth = made.network._worlds[0], []
+        for _ in range(200):
+            made.run(1)
+            truth.append([motor.position_rad for motor in world.truth().motors])
+        mapped = {
+            o.signal for node in (1, 2) for tpdo in made.daemon.layouts[node].tpdos for o in tpdo.objects
+        }
+        assert {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD} <= mapped
+        assert not any(e.status & Status.STALE for e, _ in made.collector.estimates[2:])
+        measured = np.array([sample.motor_position_rad for sample, _ in made.collector.samples])
+        assert np.ptp(measured[:, 0]) > 0.01
+        assert measured[-150:-2] == pytest.approx(np.array(truth)[-150:-2], abs=2e-3)

@@ -19,7 +19,7 @@ from estimator.diagnosis import diagnose
 from estimator.diagnosis.heldout import Held
 from estimator.errors import EstimatorError
 from estimator.identify import identify
-from estimator.model import Effect, JointModel
+from estimator.model import Effect, JointModel, Transmission
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import MODELS
 from sim.world import record as simulated
@@ -107,8 +107,7 @@ def test_two_effects_are_both_named_and_a_halved_inertia_is_doubted(records):
     declared, doubt = kit.model(), "hardly to be believed"
     names = {effect.name for effect in diagnose(records["two"], declared).effects}
     assert {"coulomb_friction", "gravity"} <= names
-    light = replace(declared.motors[0], inertia_kg_m2=kit.INERTIA / 2)
-    found = diagnose(records["clean"], replace(declared, motors=(light,)))
+    found = diagnose(records["clean"], joints.with_motor(declared, inertia_kg_m2=kit.INERTIA / 2))
     assert found.effects[0].name == "motor_inertia"
     assert any(doubt in note for note in found.notes)
     assert not any(doubt in note for note in diagnose(records["inertia"], declared).notes)
@@ -340,9 +339,7 @@ def test_a_spring_that_is_no_polynomial_is_no_play_where_the_order_is_open():
 
 def test_a_spring_that_the_declared_law_does_not_hold_is_no_finding_in_a_second_recording():
     first, second = (kit.World([{"bend_nm_rad2": 1500.0}], seed=seed).run()[0] for seed in (1, 2))
-    model = _open_polynomial(kit.model())
-    (motor,) = model.motors
-    cubic = replace(model, motors=(replace(motor, transmission=replace(motor.transmission, order=2)),))
+    cubic = joints.with_motor(kit.model(), transmission=Transmission(model="polynomial", order=2))
     fitted = identify(first, cubic)
     found = diagnose(second, as_read(fitted.model, first, fitted.surplus))
     assert (found.verdict, found.effects) == ("sufficient", ())
@@ -363,19 +360,20 @@ def test_no_order_is_chosen_whose_coefficients_no_joint_file_holds():
     """Of a stiff joint: a thousandth of the deflection, and so of the motion."""
     (record,) = kit.World([{"bend_nm_rad2": 1500.0}]).run()
     assert record.link_position_rad is not None
-    (motor,) = kit.model(linked=False).motors
-    stiff = replace(motor, inertia_kg_m2=1e3 * kit.INERTIA, viscous_damping_nm_s_rad=1e3 * kit.DAMPING)
+    heavy = {"inertia_kg_m2": 1e3 * kit.INERTIA, "viscous_damping_nm_s_rad": 1e3 * kit.DAMPING}
+    stiff = joints.with_motor(kit.model(linked=False), **heavy)
     small = replace(
         record,
         motor_position_rad=1e-3 * record.motor_position_rad,
         link_position_rad=1e-3 * record.link_position_rad,
     )
-    free = _open_polynomial(replace(kit.model(linked=False), motors=(stiff,)))
-    coefficients = identify(small, free).model.motors[0].transmission.parameters["coefficients_nm_rad"]
+    coefficients = (
+        identify(small, _open_polynomial(stiff))
+        .model.motors[0]
+        .transmission.parameters["coefficients_nm_rad"]
+    )
     assert isinstance(coefficients, tuple) and coefficients[0] == pytest.approx(1e3 * kit.STIFFNESS, rel=0.2)
 
 
 def _open_polynomial(model: JointModel) -> JointModel:
-    (motor,) = model.motors
-    own = replace(motor.transmission, model="polynomial")
-    return replace(model, motors=(replace(motor, transmission=own),))
+    return joints.with_motor(model, transmission=Transmission(model="polynomial"))

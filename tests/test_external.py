@@ -15,12 +15,9 @@ from estimator import (
     EstimatorError,
     EstimatorSettings,
     ExternalStatus,
-    JointModel,
     LinkDynamics,
-    Motor,
     Sample,
     Status,
-    Transmission,
     make_estimator,
 )
 from estimator.filters import StateVariableFilter
@@ -180,10 +177,7 @@ def test_a_hand_that_guides_the_link_is_no_error_of_its_dynamics():
     truth, measured = joints.guided(*joints.polynomial(np.array([[[150.0]]])), 15000)
     link = LinkDynamics(inertia_kg_m2=0.55, viscous_damping_nm_s_rad=0.13, gravity_nm=0.02)
     known = {"parameters": {"k_nm_rad": 150.0}, "covariance": ((1.0,),)}  # as `fit` has written it
-    motor = Motor(
-        inertia_kg_m2=0.12, viscous_damping_nm_s_rad=0.8, transmission=Transmission(model="linear", **known)
-    )
-    model = JointModel(arrangement="single", motors=(motor,), link=link)
+    model = joints.joint_model(0.12, 0.8, model="linear", **known, link=link)
     estimator = make_estimator(model, EstimatorSettings(), T)
     said = []
     for sample in measured.samples():

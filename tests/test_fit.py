@@ -295,10 +295,7 @@ def test_a_link_of_which_only_its_declaration_tells_keeps_its_inertia_and_the_st
     torque += np.random.default_rng(0).normal(0.0, 0.01 * np.std(torque), len(time))
     count = 2.0 * np.pi / 2**23
     theta, q = (joints.quantise(wave(0, time, scale), count) for scale in (size, size * (1.0 + bent)))
-    motor = Motor(
-        inertia_kg_m2=inertia, viscous_damping_nm_s_rad=damping, transmission=Transmission(model="linear")
-    )
-    model = JointModel(arrangement="single", motors=(motor,), link=LinkDynamics(inertia_kg_m2=link))
+    model = joints.joint_model(inertia, damping, model="linear", link=LinkDynamics(inertia_kg_m2=link))
     found = identify(joints.recorded(theta, torque, q), model)
     assert found.model.link.inertia_kg_m2 == pytest.approx(link, rel=0.03)
     assert found.fits[0].parameters["k_nm_rad"] == pytest.approx(stiffness, rel=0.03)
@@ -323,8 +320,7 @@ def test_link_dynamics_that_are_declared_wrong_by_any_factor_are_found_and_said(
 def test_a_motor_inertia_that_is_declared_wrong_by_any_factor_is_found_said_and_never_sufficient(factor):
     (record,) = kit.World([{}]).run()
     model = kit.model(linked=False)
-    (motor,) = model.motors
-    wrong = replace(model, motors=(replace(motor, inertia_kg_m2=factor * motor.inertia_kg_m2),))
+    wrong = joints.with_motor(model, inertia_kg_m2=factor * kit.INERTIA)
     assert judge(record, wrong).inertia[0] == pytest.approx(1.0 / factor, rel=0.3)
     assert not judge(record, model).inertia
     found = identify(record, wrong)

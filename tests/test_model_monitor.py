@@ -73,7 +73,7 @@ def test_a_registered_law_is_monitored_like_one_of_the_library(runs, fitted, mon
     mine = replace(model.motors[0].transmission, model="straight", order=None)
     monitors = [
         ModelMonitor(joint, kit.PERIOD_S, baseline)
-        for joint in (model, replace(model, motors=(replace(model.motors[0], transmission=mine),)))
+        for joint in (model, joints.with_motor(model, transmission=mine))
     ]
     some = joints.part(runs["coulomb_nm"], slice(2600))
     raised = [_play(monitor, some) for monitor in monitors]

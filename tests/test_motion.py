@@ -69,7 +69,7 @@ def test_what_a_driven_model_reads_its_free_run_gives_back():
     numbers[:, :2] = -1.0, 0.0  # steady ones
     path = Shape(numbers, 8.0, limits()).path(2e-3)
     for effects in ((), (lossy,)):
-        changed = replace(model, motors=(replace(model.motors[0], effects=effects),))
+        changed = joints.with_motor(model, effects=effects)
         for run in driven(path, changed):
             assert min(free_run(run, changed, 1.0).fit_percent.values()) > 97.0
 

@@ -20,7 +20,7 @@ from drivelink.demo.simulate import alter, world_from_joint
 from drivelink.errors import DrivelinkError
 from drivelink.output.comparison import simulated
 from drivelink.output.document import show
-from estimator import Effect, EstimatorError, JointModel, LinkDynamics, Motor, Record, Transmission
+from estimator import Effect, EstimatorError, JointModel, LinkDynamics, Record, Transmission
 from estimator.filters import smoothed
 from estimator.freerun import free_run, nrmse_fit
 from sim.world import record
@@ -103,13 +103,10 @@ FRICTION = Effect(name="coulomb_friction", parameters={"torque_nm": 0.05, "smoot
 
 
 def joint(**motor: object) -> JointModel:
-    made = Motor(
-        inertia_kg_m2=0.02,
-        viscous_damping_nm_s_rad=0.05,
-        transmission=Transmission(model="linear", parameters=SPRING),
-    )
     link = LinkDynamics(inertia_kg_m2=0.04, viscous_damping_nm_s_rad=0.01, gravity_nm=0.6)
-    return JointModel(arrangement="single", motors=(replace(made, **motor),), link=link)
+    return joints.with_motor(
+        joints.joint_model(0.02, 0.05, model="linear", parameters=SPRING, link=link), **motor
+    )
 
 
 @cache

@@ -193,13 +193,14 @@ def play(
     model_monitor: ModelMonitor | None = None,
     restarted: int | None = None,
     look: Callable[[int, Estimator], object] = lambda _k, _estimator: None,
+    period_s: float = PERIOD_S,
     **settings: Any,
 ) -> tuple[Estimates, Estimator]:
     """An estimator's word on these samples, with a model monitor's as the service adds it, and the estimator.
 
     `look` is called after each sample, with its place; at the place `restarted` a node has begun anew.
     """
-    estimator = make_estimator(model, EstimatorSettings(**settings), PERIOD_S)
+    estimator = make_estimator(model, EstimatorSettings(**settings), period_s)
     # What it is given are samples already.
     pipeline = JointPipeline(Assembler((), 0), estimator, model_monitor)
     rows = []
@@ -222,6 +223,12 @@ def wrong_torque(estimates: Estimates, truth: np.ndarray) -> np.ndarray:
     """Which samples have a valid torque that is off by more than a quarter of the true one's rms."""
     off = np.abs(estimates.torque_nm - truth) <= WRONG_TORQUE * np.sqrt(np.mean(truth**2))
     return np.asarray(estimates.torque_valid & ~off)
+
+
+def is_right(found: Estimates, motion: Motion, valid: np.ndarray, begin: int = 0) -> bool:
+    """Whether from that sample on something is valid, and its torque within a quarter of the true one's rms."""
+    off = np.abs(found.torque_nm - motion.torque_nm)[begin:][valid[begin:]]
+    return bool(len(off) and np.all(off < WRONG_TORQUE * np.sqrt(np.mean(motion.torque_nm**2))))
 
 
 def without(samples: Sequence[Sample], share: float, seed: int) -> tuple[list[Sample], np.ndarray]:

@@ -11,7 +11,7 @@ import numpy as np
 import onlinekit as kit
 import pytest
 
-from estimator import Effect, EstimatorSettings, Status, make_estimator, register
+from estimator import Effect, Status, register
 from estimator.transmissions import MODELS
 from sim.effects import make
 
@@ -109,13 +109,11 @@ def test_powers_beyond_the_declared_order_are_found_and_named():
     truth = joints.simulate(plants, tau, T)
     record = joints.record(truth, 0, T, motor_counts=8192, link_bits=17, torque_noise=noise)
     for order, longer in ((2, True), (3, False), (None, False)):
-        estimator = make_estimator(joints.joint_model(B, D, order=order), EstimatorSettings(), T)
-        out = [estimator.step(sample) for sample in record.samples()]
-        settled = [bool(one.status & Status.VALID) for one in out[3000:]]
-        off = np.abs([one.stiffness_nm_rad for one in out] - truth.sigma[:, 0, 0])[3000:][settled]
-        std = np.array([one.stiffness_std_nm_rad for one in out])[3000:][settled]
+        found, estimator = kit.play(joints.joint_model(B, D, order=order), record.samples())
+        settled = found.valid[3000:]
+        off = np.abs(found.stiffness_nm_rad - truth.sigma[:, 0, 0])
         assert np.mean(settled) > 0.99
-        assert np.mean(off < 3.0 * std) > 0.99
+        assert np.mean((off < 3.0 * found.std_nm_rad)[3000:][settled]) > 0.99
         assert ("higher_order_stiffness" in estimator.undeclared()[0]) == longer
 
 
@@ -125,13 +123,13 @@ def test_an_unknown_spring_may_have_a_corner_and_be_bent_to_one_side(pull):
     moved cannot be told from another curve, and moving it made torques wrong by a tenth and more of theirs."""
     truth, record = joints.pulled(*SPRINGS["exponential"][:2], pull, N)
     joint = joints.joint_model(B, D, model="unknown", order=None)
-    estimator = make_estimator(joint, EstimatorSettings(), T)
-    out = [estimator.step(sample) for sample in record.samples()]
-    assert all(one.status & Status.VALID and one.status & Status.TORQUE_VALID for one in out[4000:])
-    off = np.abs([one.stiffness_nm_rad for one in out] - truth.sigma[:, 0, 0])[4000:]
-    assert np.mean(off < 3.0 * np.array([one.stiffness_std_nm_rad for one in out])[4000:]) > 0.99
+    found, estimator = kit.play(joint, record.samples())
+    both = int(Status.VALID | Status.TORQUE_VALID)
+    assert np.all(found.status[4000:] & both == both)
+    off = np.abs(found.stiffness_nm_rad - truth.sigma[:, 0, 0])[4000:]
+    assert np.mean(off < 3.0 * found.std_nm_rad[4000:]) > 0.99
     assert np.sqrt(np.mean((off / truth.sigma[4000:, 0, 0]) ** 2)) < 2e-3
-    lost = np.abs([one.flexibility_torque_nm for one in out] - truth.tau_e[:, 0, 0])[4000:]
+    lost = np.abs(found.torque_nm - truth.tau_e[:, 0, 0])[4000:]
     assert np.max(lost) < 0.01 * np.sqrt(np.mean(truth.tau_e**2))
     assert not any(estimator.undeclared())
 

@@ -137,12 +137,6 @@ def rebooted(joint, samples, offs, reads=first, look=lambda _k, _estimator: None
     return kit.play(joint, map(reads, samples, off.tolist()), look=began)
 
 
-def is_right(found, motion, valid, begin=0):
-    """What is valid has a torque within the limit of the fault matrix, a quarter of the torque's rms."""
-    off = np.abs(found.torque_nm - motion.torque_nm)[begin:][valid[begin:]]
-    return len(off) and np.all(off < kit.WRONG_TORQUE * np.sqrt(np.mean(motion.torque_nm**2)))
-
-
 @mostly_slow(("name", "off"), ("constant", 0.1), ("quadratic", 0.0), ("vsa-ii", 2.6))
 def test_a_drive_that_counts_from_elsewhere_after_a_reboot_is_not_believed_before_motion_has_shown_from_where(
     name, off
@@ -153,7 +147,7 @@ def test_a_drive_that_counts_from_elsewhere_after_a_reboot_is_not_believed_befor
     assert said == ["lost"]
     assert found.valid[LOST - 1000 : LOST].all() and found.valid[-4000:].mean() > 0.9
     assert np.all(np.abs(found.stiffness_nm_rad / motion.stiffness_nm_rad - 1.0)[found.valid] < 0.1)
-    assert is_right(found, motion, found.valid)
+    assert kit.is_right(found, motion, found.valid)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +189,7 @@ def test_what_few_blocks_between_two_reboots_say_of_a_constant_torque_is_not_car
     """The zero was not where they took it to be, so the torque at it is none."""
     motion = kit.motion("quadratic", 10.0)
     found, _ = rebooted(kit.declared("quadratic"), motion.samples, {100: -0.06, 1100: 0.02})
-    assert is_right(found, motion, found.valid) and np.sum(found.valid) > 1000
+    assert kit.is_right(found, motion, found.valid) and np.sum(found.valid) > 1000
 
 
 def test_friction_is_found_anew_after_a_reboot():
@@ -209,7 +203,7 @@ def test_friction_is_found_anew_after_a_reboot():
         for sample, more in zip(motion.samples, torques, strict=False)
     ]
     found, _ = rebooted(kit.declared("constant"), rubbing + motion.samples[12000:], {12000: 0.0})
-    assert is_right(found, motion, found.valid, 12000) and found.valid[-1]
+    assert kit.is_right(found, motion, found.valid, 12000) and found.valid[-1]
 
 
 def test_a_zero_that_was_only_guessed_is_no_measure_of_the_next_one():
@@ -217,7 +211,7 @@ def test_a_zero_that_was_only_guessed_is_no_measure_of_the_next_one():
     joint = load(QUADRATIC)
     motion = kit.moved(record(world_from_joint(joint, seed=1), 20.0))
     found, _ = rebooted(joint.model(), motion.samples, {400: 0.1876, 4400: -0.0625}, link)
-    assert is_right(found, motion, found.torque_valid) and found.valid[-1]
+    assert kit.is_right(found, motion, found.torque_valid) and found.valid[-1]
 
 
 @mostly_slow(("name", "after"), ("constant", 840), ("quadratic", 880), ("constant", 920))
@@ -226,7 +220,7 @@ def test_a_doubted_sample_in_the_middle_of_that_judgement_does_not_end_it(name, 
     motion = kit.motion(name, 14.0)
     doubt = lambda k, estimator: k == LOST + after - 1 and estimator.distrust()  # noqa: E731
     found, _ = rebooted(kit.declared(name), motion.samples, {LOST: 0.1}, look=doubt)
-    assert is_right(found, motion, found.valid, LOST)
+    assert kit.is_right(found, motion, found.valid, LOST)
 
 
 def moves_with_rests(seconds, seed):

@@ -176,37 +176,33 @@ def test_a_frozen_channel_is_noticed_and_survived(rig, channel):
 def test_a_drive_that_hangs_in_the_first_second_of_motion_is_noticed(name, rest_s, all_hang):
     """How long readings repeat is learned from their changes in motion: neither at rest nor from what hangs."""
     motion, rest = kit.motion(name, 7.0, seed=8), round(rest_s / kit.PERIOD_S)
-    first, hung = motion.samples[0], motion.samples[955]
-    estimator = kit.make_estimator(kit.declared(name), kit.EstimatorSettings(), kit.PERIOD_S)
-    for k in range(rest):
-        estimator.step(first._replace(sequence=k))
-    valid = []
-    for k, sample in enumerate(motion.samples):
-        if 955 <= k < 1755:
-            sample = (
-                hung
-                if all_hang
-                else sample._replace(
-                    motor_position_rad=(*sample.motor_position_rad[:-1], hung.motor_position_rad[-1]),
-                    motor_torque_nm=(*sample.motor_torque_nm[:-1], hung.motor_torque_nm[-1]),
-                )
-            )
-        one = estimator.step(sample._replace(sequence=rest + k))
-        valid.append(one.status & kit.VALID)
-        off = abs(one.stiffness_nm_rad / motion.stiffness_nm_rad[k] - 1.0)
-        assert not valid[-1] or off < max(0.1, 3.0 * one.stiffness_std_nm_rad / motion.stiffness_nm_rad[k]), k
+    hung = motion.samples[955]
+    last = {key: getattr(hung, key)[-1] for key in ("motor_position_rad", "motor_torque_nm")}
+
+    def hangs(sample):
+        return sample._replace(**{key: (*getattr(sample, key)[:-1], value) for key, value in last.items()})
+
+    moving = [
+        sample if not 955 <= k < 1755 else hung if all_hang else hangs(sample)
+        for k, sample in enumerate(motion.samples)
+    ]
+    samples = [sample._replace(sequence=k) for k, sample in enumerate(moving[:1] * rest + moving)]
+    found, _ = kit.play(kit.declared(name), samples)
+    valid, stiffness = found.valid[rest:], motion.stiffness_nm_rad
+    off = np.abs(found.stiffness_nm_rad[rest:] - stiffness)
+    assert np.all((off < np.maximum(0.1 * stiffness, 3.0 * found.std_nm_rad[rest:]))[valid])
     assert not any(valid[980:1755]) and any(valid[-1000:])
 
 
 def test_a_link_encoder_that_repeats_itself_for_a_moment_has_not_moved_its_zero():
-    motion, valid = kit.motion("vsa-ii", 8.0, seed=5), []
-    estimator = kit.make_estimator(kit.declared("vsa-ii"), kit.EstimatorSettings(), kit.PERIOD_S)
-    hung, rms = motion.samples[1512].link_position_rad, np.sqrt(np.mean(motion.torque_nm**2))
-    for k, sample in enumerate(motion.samples):
-        one = estimator.step(sample._replace(link_position_rad=hung) if 1512 <= k < 1542 else sample)
-        valid.append(one.status & kit.VALID)
-        assert not valid[-1] or abs(one.flexibility_torque_nm - motion.torque_nm[k]) < 0.25 * rms, k
-    assert np.mean(valid[2000:]) > 0.9
+    motion = kit.motion("vsa-ii", 8.0, seed=5)
+    hung = motion.samples[1512].link_position_rad
+    samples = [
+        sample._replace(link_position_rad=hung) if 1512 <= k < 1542 else sample
+        for k, sample in enumerate(motion.samples)
+    ]
+    found, _ = kit.play(kit.declared("vsa-ii"), samples)
+    assert kit.is_right(found, motion, found.valid) and np.mean(found.valid[2000:]) > 0.9
 
 
 def test_an_encoder_that_moves_its_zero_is_followed(rig):

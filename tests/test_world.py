@@ -7,18 +7,16 @@ from pathlib import Path
 
 import joints
 import numpy as np
+import onlinekit as kit
 import pytest
 
 from estimator import (
     Effect,
     EstimatorError,
-    EstimatorSettings,
     JointModel,
     LinkDynamics,
-    Record,
     Status,
     fit,
-    make_estimator,
 )
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.fourier import Shape
@@ -35,17 +33,6 @@ def simulated(settings: str):
     """A joint by the program's settings, `NAME=VALUE …`."""
     given = dict(one.split("=") for one in settings.split())
     return simulate(**{name: float(text) if name == "period" else text for name, text in given.items()})
-
-
-def played(record: Record, model: JointModel):
-    """(estimator, stiffness, its standard deviation, whether it is valid)."""
-    estimator = make_estimator(model, EstimatorSettings(), record.period_s)
-    said = [
-        (one.stiffness_nm_rad, one.stiffness_std_nm_rad, int(one.status) & Status.VALID)
-        for one in map(estimator.step, record.samples())
-    ]
-    stiffness, std, valid = np.array(said).T
-    return estimator, stiffness, std, valid > 0
 
 
 EXACT = "motor_counts=0 link_bits=0 seconds=2"
@@ -129,10 +116,10 @@ def test_the_interval_holds_what_the_shape_of_an_undeclared_effect_may_be_off():
     """A gear's losses are nearly, not quite, of the shape that the estimator has for them."""
     settings = "spring=cubic stiffness=120 cubic=3600 gear_loss=0.05 seconds=20 size=7.2 link_bits=18"
     record, truth, _ = simulated(settings)
-    estimator, stiffness, std, valid = played(record, joints.joint_model(0.12, 0.8))
-    off = np.abs(stiffness - truth)[valid]
-    assert "load_dependent_friction" in estimator.undeclared()[0] and np.mean(valid) > 0.8
-    assert np.mean(off < 1.96 * std[valid]) > 0.95
+    found, estimator = kit.play(joints.joint_model(0.12, 0.8), record.samples())
+    off = np.abs(found.stiffness_nm_rad - truth)[found.valid]
+    assert "load_dependent_friction" in estimator.undeclared()[0] and np.mean(found.valid) > 0.8
+    assert np.mean(off < 1.96 * found.std_nm_rad[found.valid]) > 0.95
 
 
 def test_a_stiff_joint_that_moves_fast_is_not_taken_for_a_soft_one_with_a_late_link():
@@ -141,10 +128,11 @@ def test_a_stiff_joint_that_moves_fast_is_not_taken_for_a_soft_one_with_a_late_l
         "stiffness=7.6e6 inertia=420 damping=1700 link_inertia=310 link_damping=520 gravity=700 period=0.004 size=3700 "
         "motion=pushes push=1850 seconds=12 seed=3 motor_counts=819200 link_bits=21 torque_noise=20 link_delay=0.012"
     )
-    _, stiffness, _, valid = played(simulated(settings).record, joints.joint_model(420.0, 1700.0))
+    record = simulated(settings).record
+    found, _ = kit.play(joints.joint_model(420.0, 1700.0), record.samples(), period_s=record.period_s)
+    off = np.abs(found.stiffness_nm_rad / 7.6e6 - 1.0)
     # Noise of the encoders leaves a percent; a spring that holds the delay has a fiftieth of it.
-    assert np.all(np.abs(stiffness[-250:] / 7.6e6 - 1.0) < 0.05)
-    assert np.all(np.abs(stiffness[valid] / 7.6e6 - 1.0) < 0.2)
+    assert np.all(off[-250:] < 0.05) and np.all(off[found.valid] < 0.2)
 
 
 HELD = "spring=cubic stiffness=120 cubic=3600 seconds=12 size=7 link_bits=17"

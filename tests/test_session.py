@@ -74,6 +74,11 @@ def test_when_the_first_daemon_is_killed_the_others_are_received_again(endpoint)
                 hear(session, {"a", "b", "c"})
 
 
+def test_daemons_that_start_before_any_of_them_listens_still_meet(three):
+    with plain_client(three[0]) as session:
+        hear(session, {"a", "b", "c"})
+
+
 def test_nothing_listens_beyond_the_loopback_and_nothing_is_multicast(three):
     endpoint, processes = three
     config = daemon_config(endpoint, listen=True)

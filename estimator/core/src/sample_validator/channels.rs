@@ -114,19 +114,20 @@ impl SampleValidator {
 
 /// Whether a position that now stands did so out of motion: it was never, as far as its resolution `count` tells, half
 /// as fast as on average, and friction stops it later: with a way that bends by at most `bend` a period it goes
-/// n² bend / 2 in the last n.
+/// n² bend / 2 in the last n, of which the last count is not read.
 fn stops_dead(trail: &VecDeque<[f64; PLACES]>, place: usize, count: f64, bend: f64) -> bool {
     let last = trail.len() - 1;
     let way = |n: usize| (trail[last][place] - trail[last - n][place]).abs();
     let half = |n: usize| 0.5 * way(last) * n as f64 / last as f64;
     way(last) > FAR * count
         && (1..last).all(|n| half(n) < count || way(n) > half(n))
-        && (1..last).any(|n| way(n) - count > 0.5 * bend * (n * n) as f64)
+        && (1..last).any(|n| way(n) > ((0.5 * bend).sqrt() * n as f64 + count.sqrt()).powi(2))
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::SampleValidator;
+    use super::stops_dead;
     use crate::model::{Arrangement, Model, Motor, Transmission};
     use crate::sample::{MOTORS, Sample};
 
@@ -161,6 +162,19 @@ mod tests {
             for resolution in [validator.resolution()[0], validator.resolution()[1]] {
                 assert!((resolution - count).abs() < 1e-3 * count, "{resolution} of {count}");
             }
+        }
+    }
+
+    #[test]
+    fn friction_stops_no_motor_dead_wherever_between_two_counts_it_rests() {
+        let bend = 0.04; // counts in a period
+        for rest in (0..100).map(|percent| 0.01 * f64::from(percent)) {
+            let read = |before: u32| (rest - 0.5 * bend * f64::from(before).powi(2)).floor();
+            let last = (0..).find(|before| read(before + 1) < read(0)).unwrap();
+            let trail = |read: &dyn Fn(u32) -> f64| (0..=20).rev().map(|k| [read(last + k); 3]).collect();
+            assert!(!stops_dead(&trail(&read), 0, 1.0, bend), "{rest}");
+            let hangs = |before: u32| (rest - 1.5 * f64::from(before)).floor();
+            assert!(stops_dead(&trail(&hangs), 0, 1.0, bend), "{rest}");
         }
     }
 }

@@ -1,7 +1,6 @@
 """Words of drives, files and messages as plain text: what a terminal or a browser would obey is left out."""
 
 import codecs
-import difflib
 import html
 import logging
 import os
@@ -11,7 +10,7 @@ import sys
 import textwrap
 import time
 import unicodedata
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from itertools import accumulate
 from typing import TextIO
 
@@ -40,12 +39,6 @@ def some(names: Iterable[object], length: int = _ROOM) -> str:
     shown = [str(name)[:length] for name in names]
     fit = sum(used <= _ROOM for used in accumulate(map(len, shown[:_SHOWN]))) or 1
     return ", ".join(shown[:fit]) + (f", … ({len(shown)} in all)" if len(shown) > fit else "")
-
-
-def expected(name: str, known: Collection[str]) -> str:
-    """Return what was expected instead of an unknown name: the nearest, or one of all."""
-    close = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
 
 
 def natural(name: str) -> list[str | tuple[int, str]]:

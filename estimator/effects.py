@@ -16,7 +16,7 @@ import numpy as np
 
 from estimator import _core
 from estimator._core import STOP_EXPONENT as STOP_EXPONENT
-from estimator.errors import EstimatorError
+from estimator.errors import EstimatorError, expected
 from estimator.model import Effect, JointModel
 from estimator.sample import FloatArray
 
@@ -141,7 +141,7 @@ def elements(effect: Effect) -> tuple[EffectType, list[dict[str, float]]]:
     """
     kind = LIBRARY.get(effect.name)
     if kind is None:
-        raise EstimatorError(f'effect "{effect.name}": expected one of {", ".join(sorted(LIBRARY))}')
+        raise EstimatorError(f'effect "{effect.name}": {expected(effect.name, sorted(LIBRARY))}')
     values: dict[str, float | tuple[float, ...]] = {}
     for parameter in kind.parameters:
         value = effect.parameters.get(parameter.name, parameter.default)

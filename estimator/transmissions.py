@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from estimator.errors import EstimatorError
+from estimator.errors import EstimatorError, expected
 from estimator.flexibility import (
     RELATIVE_STEP,
     Exponential,
@@ -105,8 +105,8 @@ def transmission_model(transmission: Transmission) -> TransmissionModel | None:
         return None
     model = MODELS.get(transmission.model)
     if model is None:
-        known = ", ".join([*MODELS, RIGID, UNKNOWN])
-        raise EstimatorError(f'transmission.model: expected one of {known}, got "{transmission.model}"')
+        wanted = expected(transmission.model, [*MODELS, RIGID, UNKNOWN])
+        raise EstimatorError(f'transmission.model "{transmission.model}": {wanted}')
     if transmission.parameters:
         alpha = model.alpha(transmission.parameters)
         stiffness = model.at(0.0, alpha.tolist())[1]

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sim.effects import PlantEffect
-from sim.errors import SimError
+from sim.errors import SimError, expected
 from sim.excitation import build
 from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 from sim.sensors import RPM_RAD_S, DriveHardware, LinkEncoder
@@ -139,5 +139,5 @@ def case(name: str) -> Case:
         SimError: there is none.
     """
     if name not in CASES:
-        raise SimError(f'case: expected one of {", ".join(CASES)}, got "{name}"')
+        raise SimError(f'case "{name}": {expected(name, CASES)}')
     return CASES[name]()

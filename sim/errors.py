@@ -1,11 +1,19 @@
 """The simulated world's exceptions: one root, raised when a world is built, never while it runs."""
 
+import difflib
 import math
+from collections.abc import Collection
 from numbers import Real
 
 
 class SimError(ValueError):
     """What was wrong, where, and what was expected, in one line."""
+
+
+def expected(name: str, known: Collection[str]) -> str:
+    """Return what was expected instead of an unknown name: the nearest, or one of all."""
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
 
 
 def require(name: str, value: object, *, positive: bool) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.errors import SimError
+from sim.errors import SimError, expected
 
 Profile = Callable[[float], float]
 
@@ -50,7 +50,8 @@ class _Keys:
         """Return one of the choices; without any: any text."""
         value = self._left.pop(key, default)
         if value not in choices and (choices or not isinstance(value, str)):
-            raise SimError(f"{self._where}.{key}: expected one of {', '.join(choices)}, got {value!r}")
+            wanted = expected(str(value), choices) if choices else "expected text"
+            raise SimError(f'{self._where}.{key} "{value}": {wanted}')
         return str(value)
 
     def number(self, key: str, default: float | None, minimum: float = -math.inf) -> float:

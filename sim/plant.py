@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from sim.errors import SimError, require
+from sim.errors import SimError, expected, require
 
 Scalar = Callable[[float], float]
 Parameters = Mapping[str, float | tuple[float, ...]]
@@ -50,8 +50,9 @@ class Spring:
             SimError: unknown model, missing, unknown or impossible parameter, or a rigid coupling.
         """
         if self.model not in MODELS:
-            known = ", ".join(sorted(MODELS))
-            raise SimError(f'transmission model: expected one of {known} or "{RIGID}", got "{self.model}"')
+            raise SimError(
+                f'transmission model "{self.model}": {expected(self.model, [*sorted(MODELS), RIGID])}'
+            )
         build, names = MODELS[self.model]
         missing = [name for name in names if name not in self.parameters]
         unknown = [name for name in self.parameters if name not in names]

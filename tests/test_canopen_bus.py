@@ -19,7 +19,7 @@ def opened(**keys):
 @pytest.mark.parametrize(
     ("keys", "expected"),
     [
-        ({"interface": "soketcan"}, r'python-can has no "soketcan", expected "socketcan"\?'),
+        ({"interface": "soketcan"}, r'python-can has no "soketcan": did you mean socketcan\?'),
         ({"interface": "zzzz"}, "expected .*slcan.*virtual"),
         ({"interface": "slcan", "channel": "/dev/nowhere"}, "slcan /dev/nowhere cannot be opened"),
         ({"interface": "socketcand", "channel": "can0", "options": {"host": 7}}, "expected bus.options = .*host"),

@@ -50,7 +50,7 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(verb, arguments, tmp_path
     given = [text.format(joint="elbow.toml") for text in arguments]
     assert main([verb, *given, "--interface", "carrierpigeon", "--channel", "roof"]) == 4
     line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith(f'drivelink {verb}: bus.interface: python-can has no "carrierpigeon", expected ')
+    assert line.startswith(f'drivelink {verb}: bus.interface: python-can has no "carrierpigeon": expected ')
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(verb, arguments, tmp_path
         (["doctor", "none.toml"], 2, "none.toml: cannot be read"),
         (["service", "install", "none.toml", "--root", "stage"], 2, "none.toml: cannot be read"),
         (["new", "there.toml"], 2, "there.toml"),
-        (["completion", "sh"], 2, "invalid choice: 'sh'"),
+        (["completion", "sh"], 2, 'shell "sh": did you mean zsh?'),
         (["fit", "a.csv", "./a.csv"], 2, "given twice: expected another recording"),
         (["diagnose", "a.csv", "--validate", "a.csv"], 2, "given twice: expected another recording"),
         (["doctor", "--eds", "nowhere.eds"], 5, "nowhere.eds"),
@@ -79,13 +79,14 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(verb, arguments, tmp_path
         (["doctor", "--eds", "y.eds", "--channel", "can0"], 2, "--channel"),
         (["doctor", "--interface", "socketcan"], 2, "--interface"),
         (["record", "elbow.toml", "--out", "a.log", "--source", "bus", "--interface", "socketcan", "--channel", "can77"], 4, "can77"),
-        (["sim", "elbow.toml", "--quirks", "acme"], 2, "--quirks: expected one of strict, epos4"),
-        (["sim", "elbow.toml", "--effect", "magic=1"], 2, "--effect: expected one of"),
+        (["sim", "elbow.toml", "--quirks", "acme"], 2, '--quirks "acme": expected one of strict, epos4'),
+        (["sim", "elbow.toml", "--quirks", "epos"], 2, '--quirks "epos": did you mean epos4?'),
+        (["sim", "elbow.toml", "--effect", "magic=1"], 2, '--effect: effect "magic": expected one of'),
         (["sim", "elbow.toml", "--interface", "socketcan", "--channel", "can77"], 4, "socketcan can77"),
         (["sim", "elbow.toml", "wrist.toml"], 2, "expected the same bus.channel"),
         (["sim", "far.toml"], 4, "port"),
         (["sim", "driveless.toml"], 2, "driveless.toml: motor[1].drive: expected this table"),
-        (["fit", "r.csv", "--joint", "linaer.toml"], 2, "linaer.toml: motor[1]: transmission.model: expected one of linear"),
+        (["fit", "r.csv", "--joint", "linaer.toml"], 2, 'linaer.toml: motor[1]: transmission.model "linaer": did you mean linear?'),
         (["fit", "r.csv", "--joint", "elbow.toml", "--out", "there.toml"], 2, "there.toml: expected a folder, got a file"),
         (["compare", "elbow.toml", "elbow.toml", "--out", "there.toml"], 2, "there.toml: expected a folder, got a file"),
         (["record", "elbow.toml", "--out", "r.xyz"], 3, "expected a name that ends in .mcap"),
@@ -189,9 +190,17 @@ def test_a_console_without_unicode_gets_the_words_spelt_out(tmp_path, monkeypatc
         assert not drawn or len({len(line) for line in table}) == 1
 
 
-def test_a_misspelt_verb_has_the_one_that_is_meant(capsys):
-    assert main(["moniter"]) == 2
-    assert capsys.readouterr().err == "drivelink: there is no verb 'moniter': did you mean monitor?\n"
+def test_a_misspelt_verb_choice_or_option_has_the_one_that_is_meant(capsys):
+    assert main(["moniter"]) == main(["demo", "--case", "frictoin"]) == 2
+    verb, case = capsys.readouterr().err.splitlines()
+    assert verb == 'drivelink: VERB "moniter": did you mean monitor?'
+    assert case == 'drivelink demo: --case "frictoin": did you mean friction?'
+    with pytest.raises(SystemExit):
+        main(["sim", "elbow.toml", "--intreface", "socketcand"])
+    assert (
+        "unrecognized arguments: --intreface socketcand (did you mean --interface?)"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_joint_s_name_is_not_its_file(capsys, monkeypatch):

@@ -324,8 +324,8 @@ def test_an_effect_is_written_name_value_and_further_parameters():
     [
         ("coulomb_friction", "expected NAME=VALUE"),
         ("coulomb_friction=", "expected NAME=VALUE"),
-        ("magic=1", 'expected one of coulomb_friction.*; got "magic"'),
-        ("colomb_friction=1", r'did you mean coulomb_friction\? got "colomb_friction"'),
+        ("magic=1", 'effect "magic": expected one of coulomb_friction'),
+        ("colomb_friction=1", r'effect "colomb_friction": did you mean coulomb_friction\?'),
         ("coulomb_friction=much", 'expected a number, got "much"'),
         ("coulomb_friction=nan", "expected a finite number"),
         ("coulomb_friction=1,torque=3", "unknown parameter, expected torque_nm"),

@@ -78,8 +78,8 @@ def test_true_values_may_differ_from_the_models():
         ("[sim]\nparameters = { motor2_inertia_kg_m2 = 1.0 }", "parameters.motor2_inertia_kg_m2: unknown"),
         ("[sim]\nparameters = { link_mass = 1.0 }", "parameters.link_mass: unknown, the link has inertia"),
         ("[sim]\nparameters = { motor1_inertia_kg_m2 = -1.0 }", "expected a finite number > 0"),
-        ("[sim]\nexcitation = { kind = 'noise' }", "sim.excitation.kind: expected one of"),
-        ("[sim]\n[[sim.effect]]\nname = 'magic'", "effect: expected one of"),
+        ("[sim]\nexcitation = { kind = 'saw' }", 'sim.excitation.kind "saw": expected one of'),
+        ("[sim]\n[[sim.effect]]\nname = 'magic'", 'effect "magic": expected one of'),
         ("[sim]\ncase = 'vsa-ii'", 'elbow: sim: case "vsa-ii" is antagonistic, this joint is single'),
     ],
 )

@@ -5,7 +5,6 @@ CAN FD frames, and a check of the interface's state.
 """
 
 import contextlib
-import difflib
 import errno
 import logging
 import math
@@ -21,6 +20,7 @@ from can.interfaces import VALID_INTERFACES
 from drivelink.canopen.sdo import Program, Session
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection
+from estimator.errors import expected
 
 logger = logging.getLogger(__name__)
 
@@ -94,9 +94,8 @@ def _arguments(section: BusSection) -> dict[str, Any]:
 def _check_interface(section: BusSection) -> None:
     if section.interface in VALID_INTERFACES:
         return
-    close = difflib.get_close_matches(section.interface, VALID_INTERFACES, n=1)
-    hint = f'"{close[0]}"?' if close else ", ".join(sorted(VALID_INTERFACES))
-    raise BusError(f'bus.interface: python-can has no "{section.interface}", expected {hint}')
+    wanted = expected(section.interface, sorted(VALID_INTERFACES))
+    raise BusError(f'bus.interface: python-can has no "{section.interface}": {wanted}')
 
 
 def _check_socketcan(section: BusSection) -> None:

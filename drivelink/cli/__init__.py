@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 from drivelink.errors import DrivelinkError, JointFileError, UsageError
 from drivelink.plaintext import PlainFormatter, clean_text, spell_out
 from drivelink.version import __version__
-from estimator.errors import EstimatorError
+from estimator.errors import EstimatorError, expected
 
 if TYPE_CHECKING:
     from drivelink.jointfile import JointFile
@@ -104,9 +104,18 @@ class _Help(argparse.HelpFormatter):
         return "\n".join(lines)
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what a misspelt verb or choice may mean, in one line."""
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            name = "/".join(action.option_strings) or action.metavar or action.dest
+            raise UsageError(f'{name} "{value}": {expected(str(value), [*action.choices])}')
+
+
 def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
     """Return the parser; only the modules of the given verbs are imported and configured."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="drivelink",
         description=(sys.modules["drivelink"].__doc__ or "").partition("\n")[0],
         epilog=_EPILOG,
@@ -168,12 +177,13 @@ def _main(argv: list[str] | None) -> int:
         if not argv:
             make_parser([]).print_help(sys.stderr)
             return UsageError.exit_status
-        if not verb and (like := get_close_matches(argv[0], VERBS, 1)):
-            raise UsageError(f"there is no verb {argv[0]!r}: did you mean {like[0]}?")
         parser = make_parser([verb])
         args, unknown = parser.parse_known_args(argv)
         if unknown:  # argparse itself would show the usage of the whole program
-            getattr(args, "parser", parser).error(f"unrecognized arguments: {' '.join(unknown)}")
+            own = getattr(args, "parser", parser)
+            like = get_close_matches(unknown[0].partition("=")[0], own._option_string_actions, 1)
+            guess = f" (did you mean {like[0]}?)" if like else ""
+            own.error(f"unrecognized arguments: {' '.join(unknown)}{guess}")
         return int(args.run(args))
     except DrivelinkError as error:
         said = str(error)

@@ -20,7 +20,7 @@ from tomlkit.container import Container
 from drivelink.errors import JointFileError, raised_as
 from drivelink.files import read_regular, write_whole
 from drivelink.jointfile.schema import JointFile
-from drivelink.plaintext import expected
+from estimator.errors import expected
 from estimator.model import Effect, JointModel, Motor, ParameterValue
 
 _DIGITS = 9  # of a covariance

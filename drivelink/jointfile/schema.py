@@ -10,8 +10,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from drivelink.errors import raised_as
 from drivelink.jointfile.columns import COLUMNS, si_factor
-from drivelink.plaintext import expected
 from estimator.effects import LIBRARY, elements
+from estimator.errors import expected
 from estimator.model import (
     Arrangement,
     Effect,

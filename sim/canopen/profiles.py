@@ -6,7 +6,7 @@ makers'. Here is what an EDS file cannot express.
 
 from dataclasses import dataclass
 
-from sim.errors import SimError
+from sim.errors import SimError, expected
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,5 +82,5 @@ def profile(name: str) -> Quirks:
         SimError: there is none.
     """
     if name not in PROFILES:
-        raise SimError(f'quirks: expected one of {", ".join(PROFILES)}, got "{name}"')
+        raise SimError(f'quirks "{name}": {expected(name, PROFILES)}')
     return PROFILES[name]

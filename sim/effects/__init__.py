@@ -7,14 +7,13 @@ to tau_e. Names and parameters are the estimator's, so that a model can be simul
 independent.
 """
 
-import difflib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 
 from sim.effects.assembly import LISTED, UNLISTED, Assembly, Definition, Values
-from sim.errors import SimError
+from sim.errors import SimError, expected
 from sim.plant import JointPlant
 
 __all__ = ["LISTED", "UNLISTED", "Assembly", "Definition", "PlantEffect", "assemble", "make", "parse"]
@@ -51,9 +50,7 @@ def make(name: str, parameters: Mapping[str, object], motor: int | None = None) 
     definition = LISTED.get(name) or UNLISTED.get(name)
     if definition is None:
         known = (*LISTED, *UNLISTED)
-        close = difflib.get_close_matches(name, known, n=1)
-        guess = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)};"
-        raise SimError(f'effect: {guess} got "{name}"')
+        raise SimError(f'effect "{name}": {expected(name, known)}')
     given = {key: _number(f"{name}.{key}", value) for key, value in parameters.items()}
     which = given.pop("motor", 1.0 + (motor or 0))
     if which not in (1.0, 2.0):

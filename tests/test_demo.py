@@ -7,9 +7,11 @@ import logging
 import math
 import os
 import re
+import select
 import signal
 import subprocess
 import sys
+import termios
 import threading
 import time
 from pathlib import Path
@@ -97,6 +99,25 @@ def test_a_live_view_is_drawn_by_the_thread_that_feeds_it(monkeypatch):
     subscription = SimpleNamespace(cycles=lambda _: [message(1, 2.0, 100.0), None], status=None)
     run.follow(RigProcess(SimpleNamespace(poll=poll), lambda: None), subscription)
     assert len(drawn) > 2 and set(drawn) == {threading.current_thread()}
+
+
+def test_keys_are_not_echoed_into_the_view_nor_left_for_the_shell(monkeypatch):
+    master, slave = os.openpty()
+    console = Console(file=io.StringIO(), force_terminal=True, width=80, height=24)
+    run, echoed = DemoRun(jointfile.load(ELBOW), console, live=True), []
+    subscription = SimpleNamespace(cycles=lambda _: [None], status=None)
+
+    def poll(_):
+        echoed.append(bool(termios.tcgetattr(slave)[3] & termios.ECHO))
+        os.write(master, b"x")
+        run.summary = SUMMARY if len(echoed) > 2 else None
+
+    with os.fdopen(slave) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        run.follow(RigProcess(SimpleNamespace(poll=poll), lambda: None), subscription)
+        assert echoed == [False, False, False] and termios.tcgetattr(slave)[3] & termios.ECHO
+        assert not select.select([slave], [], [], 0)[0]
+    os.close(master)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from drivelink.demo.watching import DemoRun
 from drivelink.jointfile import JointFile
 from drivelink.loop import finding
 from drivelink.loop.acceptance import Proposal, Trial, accept, proposal
-from drivelink.monitor.terminal import Keys
 from drivelink.output.document import Grid, Paragraph, Rows, Section
 from drivelink.output.numbers import number, value_and_interval
 from drivelink.pubsub.client import Subscription
@@ -94,15 +93,13 @@ class ClosedLoop(DemoRun):
         self.trial: Trial | None = None  # the residual after it, or None
         self.over = False  # it has ended the rig itself
         self._path, self._case, self._yes = path, case, yes
-        self._keys = Keys()
         self._limit_s = self._end_s = time.monotonic() + limit_s
         self._asking = False
 
     def follow(self, rig: Any, subscription: Subscription) -> bool:
         """See `DemoRun.follow`."""
         self._stop: Callable[[], None] = rig.stop
-        with self._keys:
-            return super().follow(rig, subscription)
+        return super().follow(rig, subscription)
 
     def _other(self, message: Any) -> None:
         if isinstance(message, Changed):
@@ -155,7 +152,7 @@ class ClosedLoop(DemoRun):
             self._end_s = time.monotonic()
 
     def _answer(self) -> None:
-        for key in self._keys.pressed():
+        for key in self._pressed:
             if key in "yY" and self._asking:
                 self._asking = False
                 self._accept()

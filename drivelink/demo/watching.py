@@ -5,7 +5,7 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -17,6 +17,7 @@ from drivelink.demo.rig import Change, Failure, RunSummary, serve
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile
 from drivelink.monitor.history import TruePoint
+from drivelink.monitor.terminal import Keys
 from drivelink.monitor.view import JointView
 from drivelink.output.document import Grid, Paragraph, Rows, Section
 from drivelink.output.numbers import number, value_and_interval
@@ -204,6 +205,8 @@ class DemoRun:
         self._screen: Live | None = None
         self._period_s = joint.bus.period_s
         self._next_line_s, self._said = 0.0, ""
+        self._keys = Keys()  # none is echoed into the view
+        self._pressed = ""  # since the last look
 
     def follow(self, rig: RigProcess, subscription: Subscription) -> bool:
         """Follow the rig to its end; return whether Ctrl-C ended it early.
@@ -211,10 +214,13 @@ class DemoRun:
         Raises:
             DrivelinkError: the rig could not run.
         """
-        if not self._live:
-            return self._to_the_end(rig, subscription)
-        # Drawn by this thread alone: the history must not grow under the one that draws it.
-        with Live(self._view, console=self._console, auto_refresh=False, transient=True) as self._screen:
+        with ExitStack() as stack:
+            stack.enter_context(self._keys)
+            if (
+                self._live
+            ):  # drawn by this thread alone: the history must not grow under the one that draws it
+                live = Live(self._view, console=self._console, auto_refresh=False, transient=True)
+                self._screen = stack.enter_context(live)
             return self._to_the_end(rig, subscription)
 
     def _to_the_end(self, rig: RigProcess, subscription: Subscription) -> bool:
@@ -251,6 +257,7 @@ class DemoRun:
         """Process what a rig says besides."""
 
     def _take(self, subscription: Subscription) -> None:
+        self._pressed = self._keys.pressed()
         for estimate in subscription.cycles(0.0):
             if estimate is None:
                 break

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import pty
+import re
 import select
 import struct
 import subprocess
@@ -82,6 +83,22 @@ def test_a_narrow_view_ends_a_number_with_an_ellipsis_and_has_no_sparkline_of_on
             text = line[2:-2].rstrip()
             assert text.endswith("…") or len(text) < width - 4, line  # else the frame cuts it
             assert width < 80 or "…" not in text
+
+
+@pytest.mark.parametrize(("motors", "external", "truth"), [(2, True, True), (1, False, False)])
+def test_the_legend_explains_what_is_there_and_fits_the_terminal(motors, external, truth):
+    view = filled(motors, truth)
+    if external:
+        view.update_external(ExternalMessage(1, 0, 1, 0.2, 0.01), 4.0)
+    shown = [re.match("│ ([a-z][a-z ]{,9})", line) for line in lines(view)]
+    labels = {match[1].rstrip() for match in shown if match} - {""}
+    view.help = True
+    legend = lines(view)
+    text = "\n".join(legend)
+    assert len(legend) <= 24 and {line[2:12].rstrip() for line in legend[1:-1]} > labels - {"each"}
+    assert [word in text for word in ("magenta", "external", "contact", "yellow")] == [
+        motors > 1, external, external, truth
+    ]  # fmt: skip
 
 
 def test_the_view_says_what_matters_at_80_by_24():

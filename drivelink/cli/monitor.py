@@ -17,6 +17,7 @@ from drivelink import jointfile
 from drivelink.cli import add_number, add_seconds, handling
 from drivelink.errors import UsageError, ZenohError
 from drivelink.loop.finding import folder_of
+from drivelink.monitor.legend import joints_legend
 from drivelink.monitor.statuslines import shape
 from drivelink.monitor.terminal import Keys, can_draw, joints_table
 from drivelink.monitor.watcher import Watcher
@@ -170,9 +171,11 @@ def _picture(
             hint = "\n\nIs a daemon running?   drivelink run JOINT   or   drivelink demo"
         return Text(f"waiting for {where} …{hint}\n\nq ends", style="dim")
     for view in views.values():
-        view.help, view.footer = helping, "? legend · q ends"
-    if len(views) == 1 or helping:
+        view.help, view.footer = helping, f"? {'back' if helping else 'legend'} · q ends"
+    if len(views) == 1:
         return next(iter(views.values()))
+    if helping:
+        return Group(joints_legend(), Text("\n? back · q ends", style="dim"))
     wrong = {name: shape(view.status or {}).look_here for name, view in views.items() if view.live}
     alarms = [Text(f"{name}: {text}", "bold red", no_wrap=True, overflow="ellipsis")
               for name, text in wrong.items() if text][: console.size.height // 3]  # fmt: skip

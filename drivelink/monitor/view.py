@@ -20,7 +20,8 @@ from rich.text import Text
 
 from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import JointHistory, TruePoint, model_curves, usual_range
-from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, external_doubt, shape, status_lines, status_text
+from drivelink.monitor.legend import joint_legend
+from drivelink.monitor.statuslines import external_doubt, shape, status_lines, status_text
 from drivelink.output.numbers import among, number, value_and_interval, with_interval
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from estimator.sample import SIGMA_95, Status
@@ -35,20 +36,6 @@ _UNSHOWN = Status.VALID | Status.OBSERVABLE | Status.PARTIAL | Status.TORQUE_VAL
 _UNUSABLE = Status.having("unusable")
 _TWO_ROWS = 20  # lines of the plots from which there are four
 SILENT_S = 1.0  # without an estimate, until the shown one is marked as old
-_HELP = (
-    ("stiffness", "of the joint, N·m/rad, ± half its 95 % interval"),
-    ("torque", "flexibility torque of the joint, N·m, ± half its 95 % interval by the last status"),
-    ("external", "external torque on the link, N·m, ± half its 95 % interval"),
-    ("deflection", "φ = q − θ of each transmission, rad; each: its stiffness, N·m/rad"),
-    ("left plot", "stiffness over deflection, band dotted, ● now; cyan motor 1, magenta 2; grey dots: model"),
-    ("right plot", "flexibility torque over time; yellow: truth of a simulation; grey: not valid"),
-    ("cycle", "99th percentiles, µs: work, answer (SYNC to last frame), SYNC late by"),
-    ("residual", "residual over its baseline (of the fit): half a bar is 1"),
-    ("contact", "something touches the link"),
-    ("valid", "the numbers may be used; not valid: do not control on them"),
-    ("observable", "the motion reveals the stiffness; else it is held, and its interval widens"),
-    ("model alarm", MODEL_ALARM_ADVICE),
-)
 
 
 class JointView:
@@ -270,16 +257,13 @@ class JointView:
             ("external", shown, contact if touch.valid else doubt, Text(sparkline(series, spark), style=ink))
         ]
 
-    @staticmethod
-    def _legend() -> Table:
-        """Return the legend of the view."""
-        table = Table.grid(padding=(0, 1, 0, 0))
-        table.add_column(no_wrap=True, style="bold")
-        table.add_column(overflow="fold")
-        for label, meaning in _HELP:
-            table.add_row(label, meaning)
-        table.add_row("", Text("? back · q ends", style="dim"))
-        return table
+    def _legend(self) -> Table:
+        latest, window = self.history.latest, self.history.window()
+        return joint_legend(
+            motors=len(latest.transmissions) if latest else 1,
+            external=self.history.touch is not None,
+            truth=bool(window) and math.isfinite(window[-1].true_stiffness_nm_rad),
+        )
 
     def _plots(self, width: int, height: int) -> Table:
         half = (width - 2) // 2

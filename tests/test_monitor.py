@@ -21,12 +21,12 @@ import zenohkit
 from rich.console import Console
 
 from drivelink import cli
-from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
+from drivelink.monitor.history import GrowingCurve, JointHistory
 from drivelink.monitor.statuslines import shape, status_lines
 from drivelink.monitor.terminal import joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.web import snapshot
-from drivelink.output.numbers import number, with_interval
+from drivelink.output.numbers import number, shared_range, usual_range, with_interval
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
@@ -342,6 +342,15 @@ def test_one_wild_value_does_not_flatten_an_axis():
         curve.add(place, 100.0, 1.0)
     assert len(curve.points()) > 40  # the wild place has not made the others coarse
     assert usual_range([]) == pytest.approx((math.nan, math.nan), nan_ok=True)
+
+
+def test_what_is_not_valid_is_inside_a_plot_and_leaves_room_to_what_is():
+    sure = [0.0, 1.0, 2.0]
+    assert shared_range(sure, [-1.0, 4.0]) == (-1.0, 4.0) and shared_range(sure, [1.0, 1e9]) == pytest.approx(
+        (0.0, 8.0)
+    )
+    assert shared_range([], [1.0, 3.0]) == (1.0, 3.0) and shared_range(sure, [math.nan]) == (0.0, 2.0)
+    assert shared_range([700.0, 700.0], [650.0]) == (650.0, 700.0)  # beside a steady value, too
 
 
 ALARM = STATUS | {

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 
 from rich.text import Text
 
-from drivelink.monitor.history import usual_range
-from drivelink.output.numbers import axis_ticks, ticks_on_rows
+from drivelink.output.numbers import axis_ticks, ticks_on_rows, usual_range
 
 _BARS = "▁▂▃▄▅▆▇█"
 # Bit of the dot at column c (0, 1) and row r (0 on top) of a braille character.

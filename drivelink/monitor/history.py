@@ -5,7 +5,7 @@ Fed with every estimate (a few microseconds each), read a few times a second.
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -21,7 +21,6 @@ _SECONDS, _KEPT = 12.0, 600  # of the history, and its points
 _USABLE = int(Status.VALID | Status.OBSERVABLE)
 _NEAR = 8  # neighbouring points on either side for the outlier test
 _GAP_S = 0.25  # without a moment: a gap in the curves
-_OUTERMOST = 0.02  # fraction of the values, both ends together, that sets no range
 _OUTDATED = 2.5  # times the usual one there
 
 
@@ -215,22 +214,6 @@ class JointHistory:
             return []
         since = self.moments[-1].time_s - self.seconds
         return [moment for moment in self.moments if moment.time_s >= since]
-
-
-def usual_range(values: Sequence[float]) -> tuple[float, float]:
-    """Return the range of a plot: that of all but the outermost values, extended to those by at most half.
-
-    Returns:
-        (low, high); (nan, nan) where there is nothing finite.
-    """
-    known = sorted(value for value in values if math.isfinite(value))
-    if not known:
-        return math.nan, math.nan
-    out = math.ceil(_OUTERMOST / 2 * len(known)) if len(known) > 4 else 0
-    low, high = known[out], known[-1 - out]
-    reach = 0.5 * (high - low)
-    low, high = max(known[0], low - reach), min(known[-1], high + reach)
-    return (low, high) if math.isfinite(high - low) else (math.nan, math.nan)
 
 
 _POINTS = 60

@@ -19,10 +19,17 @@ from rich.table import Table
 from rich.text import Text
 
 from drivelink.monitor.braille import DotPlot, sparkline
-from drivelink.monitor.history import JointHistory, TruePoint, model_curves, usual_range
+from drivelink.monitor.history import JointHistory, TruePoint, model_curves
 from drivelink.monitor.legend import joint_legend
 from drivelink.monitor.statuslines import external_doubt, shape, status_lines, status_text
-from drivelink.output.numbers import among, number, value_and_interval, with_interval
+from drivelink.output.numbers import (
+    among,
+    number,
+    shared_range,
+    usual_range,
+    value_and_interval,
+    with_interval,
+)
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from estimator.sample import SIGMA_95, Status
 
@@ -281,8 +288,8 @@ class JointView:
         curves = [curve.points() for curve in self.history.curves]
         grey = [curve.points() for curve in self.history.doubtful]
         fitted = model_curves(self.model, curves if any(curves) else grey)
-        points = [point for curve in (curves if any(curves) else grey) for point in curve]
-        low, high = usual_range([point[1] for point in points])
+        points = [point for curve in (*curves, *grey) for point in curve]
+        low, high = shared_range(*([p[1] for curve in each for p in curve] for each in (curves, grey)))
         margin = 0.15 * (high - low) + 0.02 * abs(high)
         x = usual_range([point[0] for point in points])
         plot = DotPlot(width, height, x, (low - margin, high + margin))
@@ -318,17 +325,17 @@ class JointView:
         truth: Sequence[float] = (),
         empty: str = "",
     ) -> Text:
-        """(time, value, valid) over time; what is not valid is grey and sets no scale beside what is."""
+        """(time, value, valid) over time; what is not valid is grey."""
         end = series[-1][0] if series else 0.0
-        values = [value for _, value, valid in series if valid] or [value for _, value, _ in series]
-        known = [value for value in (*values, *truth) if math.isfinite(value)]
-        plot = DotPlot(width, height, (-self.history.seconds, 0.0), usual_range(known))
+        sure = [value for _, value, valid in series if valid]
+        y = shared_range([*sure, *truth], [value for _, value, valid in series if not valid])
+        plot = DotPlot(width, height, (-self.history.seconds, 0.0), y)
         if truth:
             times = [time_s - end for time_s, *_ in series]
             plot.curve(list(zip(times, truth, strict=True)), TRUTH)
         for wanted, ink in ((False, _GREY), (True, ESTIMATE)):
             plot.curve([(t - end, value if valid is wanted else math.nan) for t, value, valid in series], ink)
-        if not known:
+        if math.isnan(y[0]):
             plot.note(empty or self._why_empty())
         return plot.render(title, "s")
 

@@ -1,9 +1,12 @@
 """Numbers as people read them: digits that follow the uncertainty, units, effects with their parameters."""
 
 import math
+from collections.abc import Sequence
 
 from estimator.model import ParameterValue
 from estimator.sample import SIGMA_95
+
+_OUTERMOST = 0.01  # fraction of the values, at each end, that sets no range
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -16,6 +19,38 @@ def number(value: float, digits: int = 4) -> str:
         return f"{mantissa}e{int(exponent)}".replace("-", "−")
     decimals = digits - 1 - (math.floor(math.log10(abs(value))) if value else 0)
     return f"{value:.{max(0, min(decimals, max(digits, 4)))}f}".replace("-", "−")
+
+
+def usual_range(values: Sequence[float]) -> tuple[float, float]:
+    """Return the range of a plot: that of all but the outermost values, extended to those by at most half.
+
+    Returns:
+        (low, high); (nan, nan) where there is nothing finite.
+    """
+    known = sorted(value for value in values if math.isfinite(value))
+    if not known:
+        return math.nan, math.nan
+    out = math.ceil(_OUTERMOST * len(known)) if len(known) > 4 else 0
+    low, high = known[out], known[-1 - out]
+    reach = 0.5 * (high - low)
+    low, high = max(known[0], low - reach), min(known[-1], high + reach)
+    return (low, high) if math.isfinite(high - low) else (math.nan, math.nan)
+
+
+def shared_range(valid: Sequence[float], doubtful: Sequence[float]) -> tuple[float, float]:
+    """Return the range of a plot of both: what is not valid leaves a quarter at least to what is.
+
+    Returns:
+        (low, high); (nan, nan) where there is nothing finite.
+    """
+    low, high = usual_range(valid)
+    least, most = usual_range(doubtful)
+    if math.isnan(low) or math.isnan(least):
+        return (low, high) if math.isnan(least) else (least, most)
+    below, above = max(0.0, low - least), max(0.0, most - high)
+    room = max(3.0 * (high - low), 0.5 * abs(high))  # beside a steady value a part of it
+    share = min(1.0, room / (below + above)) if below + above else 0.0
+    return low - share * below, high + share * above
 
 
 def axis_ticks(low: float, high: float) -> list[tuple[float, str]]:

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from drivelink.files import write_whole
+from drivelink.output.numbers import shared_range
 from drivelink.plaintext import clean_text
 from estimator.sample import SIGMA_95, FloatArray
 
@@ -259,9 +260,9 @@ def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) ->
         over_time(one, {"estimate": curve}, label, name.replace("_", " ").capitalize())
         doubtful = _thinned(_with_gaps(PlotCurve(t, np.where(valid, np.nan, y))))
         one.plot(doubtful.x, doubtful.y, color="#999999", linewidth=0.8)
-        # The wide band of the first samples would hide the rest, and so would what is not valid.
-        known = y[valid & np.isfinite(y)] if np.any(valid & np.isfinite(y)) else y[np.isfinite(y)]
-        low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
-        margin = 0.25 * (high - low) + 0.02 * abs(high)
-        one.set_ylim(low - margin, high + margin)
+        # The wide band of the first samples would hide the rest.
+        low, high = shared_range(y[valid].tolist(), y[~valid].tolist())
+        margin = 0.1 * (high - low) + 0.02 * abs(high)
+        if margin > 0.0:
+            one.set_ylim(low - margin, high + margin)
     return save(figure, path)

@@ -15,18 +15,18 @@ TIMEOUT_S = 0.01  # ten cycles at 1 kHz
 
 def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: str = "10") -> None:
     end = time.monotonic() + float(seconds)
-    passes, safe = 0, False
+    passes, safe = 0, None  # which it is, is said from the start
     with drivelink.subscribe(joint, endpoint=endpoint) as elbow:
         while time.monotonic() < end:
             estimate = elbow.wait(TIMEOUT_S)
             late = estimate is None or elbow.stale
             if late or not estimate.usable:
-                if not safe:
+                if safe is not True:
                     why = f"no estimate in time, the daemon is {elbow.state}" if late else "it is not usable"
                     print(f"safe state: {why}")
                 safe = True
                 continue
-            if safe:
+            if safe is not False:
                 print(f"in control from cycle {estimate.sequence} on")
             safe = False
             passes += 1

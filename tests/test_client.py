@@ -29,6 +29,7 @@ from drivelink import cli
 from drivelink._core import encode_estimate
 from drivelink.jointfile import parse
 from drivelink.pubsub import wire
+from drivelink.pubsub.clientbase import absent
 from drivelink.pubsub.feed import Arrivals, Feed
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_client, open_session
@@ -325,6 +326,14 @@ def test_a_name_without_daemon_is_said_once_with_the_nearest_one(publisher, endp
                 joint.wait(timeout_s=0.4) if how == "wait" else (joint.latest(), time.sleep(0.01))
             joint.wait(timeout_s=0.1)
     assert caplog.messages == ['no daemon of "elbwo"; did you mean "elbow"?']
+
+
+def test_of_several_daemons_all_are_named():
+    assert (
+        absent("elbwo", ["elbow", "knee"])
+        == 'no daemon of "elbwo", only of elbow, knee; did you mean "elbow"?'
+    )
+    assert absent("toe", ["knee"]) == 'no daemon of "toe", only of knee'
 
 
 def test_a_daemon_that_is_there_is_listed_and_not_missed(

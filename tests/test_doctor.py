@@ -215,7 +215,7 @@ def turned(layout):
     [
         ("counts_per_rev = 8192", "counts_per_rev = 4096", Severity.WARNING,
          ("counts per motor revolution", "8192", "4096")),
-        ("node_id = 5", "node_id = 6", Severity.ERROR, ("node 6", "there are node 5")),
+        ("node_id = 5", "node_id = 6", Severity.ERROR, ("node 6", "does not answer, only node 5")),
         ('channel = "doctor', 'channel = "empty', Severity.ERROR, ("no node answers",)),
         ("[bus]", '[bus]\ninterface = "socketcan"', Severity.ERROR, ("doctor-",)),
         ("node_id = 5", 'node_id = 5\neds = "elmo.eds"', Severity.WARNING, ("elmo.eds is of vendor",)),

@@ -364,7 +364,9 @@ def test_what_no_run_writes_into_the_table_is_one_line(column, value, tmp_path, 
 def test_a_linear_axis_has_metres_and_newtons():
     text = page(summarise(nights(10, axis="linear"), 0.05))
     assert "at a deflection of 0.02 m, N/m; scatter" in text and "viscous damping, N·s/m<" in text
-    assert "N·m" not in text and " rad" not in text
+    assert "N·m" not in text and " rad" not in text and "false discovery rate of" not in text
+    changed = page(summarise([night("elbow", k, 150.0 - 20.0 * (k > 9), []) for k in range(20)], 0.05))
+    assert " %, a change from a false discovery rate of " in changed and "q = " not in changed
 
 
 def test_a_stiffness_that_says_nothing_at_the_common_deflection_is_no_point():

@@ -8,6 +8,7 @@ import math
 import signal
 import struct
 import threading
+from types import SimpleNamespace
 
 import can
 import daemonkit
@@ -31,7 +32,7 @@ from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import mapping_document, recorded_layouts
 from drivelink.recording.mcapfile import recorded_cycles
-from drivelink.recording.playback import open_playback
+from drivelink.recording.playback import Summary, open_playback
 from drivelink.recording.recorder import daemon_layouts
 from drivelink.recording.sinks import Sink
 from estimator.sample import Estimate, Status
@@ -195,6 +196,12 @@ def test_missing_samples_are_counted_as_those_who_fit_count_them(tmp_path, capsy
     assert f" {json.loads(out)['samples_missing']} of " in said
     assert cli.main(["replay", str(path)]) == 0
     assert said.split(", ")[1] in capsys.readouterr().out
+
+
+def test_the_length_of_a_replay_has_no_digits_of_rounding():
+    summary = Summary(1, None, False)
+    summary._first_s, summary._last = 1.2, SimpleNamespace(time_s=7.201, tick=SimpleNamespace(estimate=None))
+    assert summary.document()["seconds"] == 6.001 != 7.201 - 1.2
 
 
 def test_what_is_strange_in_a_log_is_said(recorded, tmp_path, caplog):

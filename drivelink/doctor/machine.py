@@ -256,7 +256,7 @@ def examine_interface(section: Section, bus: BusSection) -> None:
         known = can_interfaces()
         section.error(
             bus.channel,
-            "there is no such interface" + (f"; there is {', '.join(known)}" if known else ""),
+            "there is no such interface" + (f", only {', '.join(known)}" if known else ""),
             f"sudo ip link add {bus.channel} type vcan && sudo ip link set {bus.channel} up"
             if bus.channel.startswith("vcan")
             else "plug it in, load its driver, or correct bus.channel",

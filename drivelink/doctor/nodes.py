@@ -96,7 +96,7 @@ def _ask(
         else:
             section.error(
                 role.subject,
-                f"({role.key}) does not answer" + (f"; there are {_list(others)}" if others else ""),
+                f"({role.key}) does not answer" + (f", only {_list(others)}" if others else ""),
                 f"power it, or correct {role.key}.node_id",
             )
     _name_others(section, bus, joint.bus, others, next(ends))

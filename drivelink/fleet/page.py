@@ -187,8 +187,9 @@ def _figure(joint: dict[str, Any], one: dict[str, Any]) -> str:
     several = f" of motor {one['transmission']}" if len(joint["transmissions"]) > 1 else ""
     caption = (
         f"Stiffness{several} at a deflection of {one['deflection_rad']:.3g} "
-        f"{one['deflection_unit']}, {one['unit']}; scatter "
-        f"{100 * one['scatter_relative']:.2g} %, q = {number(one['q_value'], 2)}. A cross at the bottom is a "
+        f"{one['deflection_unit']}, {one['unit']}; scatter {100 * one['scatter_relative']:.2g} %"
+        + (f", a change from a false discovery rate of {one['q_value']:.2g} on" if one["significant"] else "")
+        + ". A cross at the bottom is a "
         "recording that shows no stiffness, a hollow dot a model that was not sufficient, a dot below the "
         "axis an effect that was found at that place. A click opens the diagnosis."
     )

@@ -103,7 +103,7 @@ def write(
 
 def origin(records: Sequence[Record], recording: str, **more: Any) -> dict[str, Any]:
     """Return an entry of [provenance]: from what the model was made, what of it, when."""
-    seconds = sum(float((one.sequence[-1] - one.sequence[0]) * one.period_s) for one in records)
+    seconds = round(sum(float((one.sequence[-1] - one.sequence[0]) * one.period_s) for one in records), 6)
     written = datetime.now(UTC).isoformat(timespec="seconds")
     return {"recording": recording, "seconds": seconds, **more, "written": written, "version": __version__}
 

@@ -42,7 +42,7 @@ def write(motion: NextMotion, path: Path, units: Units, *, force: bool = False) 
 def as_json(motion: NextMotion) -> dict[str, Any]:
     """Return the odds for report.json."""
     return {
-        "seconds": float(len(motion.time_s) * (motion.time_s[1] - motion.time_s[0])),
+        "seconds": round(len(motion.time_s) * float(motion.time_s[1] - motion.time_s[0]), 6),
         "decides": motion.decides,
         "decided": motion.decided,
         "rivals": [

@@ -76,10 +76,9 @@ def absent(joint: str, names: Sequence[str]) -> str:
         return f'no daemon of "{joint}", nor of any other joint: drivelink run JOINT starts one'
     near = difflib.get_close_matches(joint, names, n=1, cutoff=0.5)
     guess = f'; did you mean "{clean_text(near[0], _MOST)}"?' if near else ""
-    if near and len(names) == 1:
-        return f'no daemon of "{joint}"{guess}'
     shown = ", ".join(clean_text(name, _MOST) for name in names[:_SHOWN])
-    return f'no daemon of "{joint}"{guess or ";"} there is {shown}{", …" if len(names) > _SHOWN else ""}'
+    others = f", only of {shown}{', …' if len(names) > _SHOWN else ''}" if names[1:] or not near else ""
+    return f'no daemon of "{joint}"{others}{guess}'
 
 
 def _enter(names: set[str], reply: zenoh.Reply, prefix: str) -> None:

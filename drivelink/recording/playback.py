@@ -333,7 +333,7 @@ class Summary:
             "observable": self.observable,
         }
         why = [{"reason": text, "cycles": count} for count, text in self._sorted()]
-        return {"seconds": seconds, **counts, "not_valid": why, "end": end}
+        return {"seconds": round(seconds, 6), **counts, "not_valid": why, "end": end}
 
     def plot(self, folder: Path, title: str) -> list[Path]:
         """Write stiffness over deflection, and torque and stiffness over time."""

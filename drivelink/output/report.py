@@ -333,6 +333,6 @@ def _doubts(outcome: Diagnosis) -> list[Block]:
         if f.alternatives
     ]
     lines += outcome.advice
-    if outcome.effects and not lines:
+    if any(finding.name != "unlisted" for finding in outcome.effects) and not lines:
         lines.append("No other effect explains these data as well.")
     return [Lines(tuple(lines))] if lines else []

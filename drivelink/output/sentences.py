@@ -26,10 +26,14 @@ def sentence(outcome: Diagnosis) -> str:
         where = outcome.effects[0]
         over = " and ".join(name.replace("_", " ") for name in where.coordinates)
         by = "a free curve" if free_curve(outcome) else "what was tried"
-        return f"The model lacks something at {_at(where, outcome)} that is not in the library" + (
-            f", a function of {over}: with {by} {fall}."
-            if lower
-            else f", and {by} over {over} does not lower {error}, {percent(held.before_relative, 2)}."
+        if lower:
+            what = f"something at {_at(where, outcome)} that is not in the library, a function of {over}"
+            return f"The model lacks {what}: with {by} {fall}."
+        left = percent(outcome.train.before_relative, 2)
+        return (
+            f"The model lacks something at {_at(where, outcome)} in the data that were fitted, {left} of "
+            f"their torque, but {by} over {over} does not lower {error}, {percent(held.before_relative, 2)}: "
+            "it may be in the former alone."
         )
     if outcome.verdict == "insufficient_excitation":
         said = f" (it might be {names})" if names else ""
@@ -73,10 +77,8 @@ def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
     share = percent(left.after_relative, 2)
     text = f"{share} of the torque ({number(left.after_rms_nm, 3)} {unit} rms) stays unexplained"
     if outcome.verdict == "unexplained":
-        free = (
-            "a free curve, which has no name in the library" if free_curve(outcome) else "whatever was tried"
-        )
-        return f"{text} even with {free}."
+        free = " even with a free curve, which has no name in the library" if free_curve(outcome) else ""
+        return f"{text}{free}."
     if outcome.verdict == "insufficient_excitation":
         return f"{text}; this motion does not reveal whether anything is missing."
     return f"{text}: noise, or effects too small to be separated from it in these data."

@@ -38,7 +38,7 @@ def usual_range(values: Sequence[float]) -> tuple[float, float]:
 
 
 def shared_range(valid: Sequence[float], doubtful: Sequence[float]) -> tuple[float, float]:
-    """Return the range of a plot of both: what is not valid leaves a quarter at least to what is.
+    """Return the range of a plot of both: what is valid keeps its share of the values, or a quarter, of it.
 
     Returns:
         (low, high); (nan, nan) where there is nothing finite.
@@ -48,7 +48,7 @@ def shared_range(valid: Sequence[float], doubtful: Sequence[float]) -> tuple[flo
     if math.isnan(low) or math.isnan(least):
         return (low, high) if math.isnan(least) else (least, most)
     below, above = max(0.0, low - least), max(0.0, most - high)
-    room = max(3.0 * (high - low), 0.5 * abs(high))  # beside a steady value a part of it
+    room = max(high - low, 0.2 * abs(high)) * min(3.0, len(doubtful) / len(valid))  # of a steady value a part
     share = min(1.0, room / (below + above)) if below + above else 0.0
     return low - share * below, high + share * above
 

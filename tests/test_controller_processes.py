@@ -56,6 +56,11 @@ def test_a_killed_daemon_and_the_way_back_in_three_processes(tmp_path):
                     reaches(events, "identify", before)
                     controller.send_signal(signal.SIGTERM)
                     assert controller.wait(60.0) == 0
+                    with python(kit.EXAMPLE / "run.py", path, *options) as piped:  # `| head`
+                        assert piped.stdout.readline()
+                        piped.stdout.close()
+                        piped.stdout = None
+                        assert "Traceback" not in piped.communicate(timeout=60)[1] and piped.returncode == 0
             finally:
                 controller.kill()
                 reader.join()

@@ -181,8 +181,9 @@ def _main(argv: list[str] | None) -> int:
         args, unknown = parser.parse_known_args(argv)
         if unknown:  # argparse itself would show the usage of the whole program
             own = getattr(args, "parser", parser)
-            like = get_close_matches(unknown[0].partition("=")[0], own._option_string_actions, 1)
-            guess = f" (did you mean {like[0]}?)" if like else ""
+            options = {option.strip("-"): option for option in own._option_string_actions}
+            like = get_close_matches(unknown[0].partition("=")[0].strip("-"), options, 1)
+            guess = f" (did you mean {options[like[0]]}?)" if like else ""
             own.error(f"unrecognized arguments: {' '.join(unknown)}{guess}")
         return int(args.run(args))
     except DrivelinkError as error:

@@ -11,6 +11,7 @@ change of phase as one line of JSON. Ctrl-C takes the torque away and ends it.
 import argparse
 import json
 import logging
+import os
 import signal
 import sys
 import time
@@ -153,3 +154,5 @@ if __name__ == "__main__":
         main()
     except DrivelinkError as error:
         sys.exit(f"run.py: {error}")
+    except BrokenPipeError:  # `| head`: it has taken the torque away, as by Ctrl-C
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -14,6 +14,7 @@ import sys
 import termios
 import time
 from datetime import UTC, datetime
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import pytest
@@ -21,6 +22,7 @@ import zenohkit
 from rich.console import Console
 
 from drivelink import cli
+from drivelink.cli.monitor import _picture
 from drivelink.monitor.history import GrowingCurve, JointHistory
 from drivelink.monitor.statuslines import shape, status_lines
 from drivelink.monitor.terminal import joints_table
@@ -99,6 +101,15 @@ def test_the_legend_explains_what_is_there_and_fits_the_terminal(motors, externa
     assert [word in text for word in ("magenta", "external", "contact", "yellow")] == [
         motors > 1, external, external, truth
     ]  # fmt: skip
+
+
+def test_of_several_joints_the_legend_is_that_of_their_table():
+    views = {name: filled(truth=False) for name in ("elbow", "knee")}
+    watcher, console = SimpleNamespace(views=views), Console(width=80, height=24)
+    table, legend = (lines(_picture(watcher, console, "", 0.0, helping)) for helping in (False, True))
+    assert "? legend" in table[-1] and "? back" in legend[-1]
+    for column in re.findall(r"[a-z]+(?: seconds)?", table[0].replace("N·m/rad", "").replace("N·m", "")):
+        assert column in ("joint", "rad") or any(line.startswith(column) for line in legend), column
 
 
 def test_the_view_says_what_matters_at_80_by_24():

@@ -44,7 +44,7 @@ def joints_legend() -> Table:
         *_NUMBERS,
         ("deflection", _DEFLECTION),
         ("last seconds", "of the stiffness"),
-        ("state", "valid: the numbers may be used; else what is wrong, red where they may not be used"),
+        ("state", "running: the numbers may be used; else what is wrong, red where they may not be used"),
     )
 
 

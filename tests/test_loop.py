@@ -184,6 +184,18 @@ def test_a_full_disk_is_a_line_of_the_diagnosis_too(tmp_path, monkeypatch, caplo
     assert said == f"elbow: {finding_file(made)}: cannot be written: No space left on device"
 
 
+@pytest.mark.parametrize(("state", "level"), [(finding.NOTHING, "INFO"), (finding.PROPOSED, "WARNING")])
+def test_a_sufficient_model_is_no_warning_in_the_log(state, level, tmp_path, monkeypatch, caplog):
+    made = tmp_path / "elbow-20260105T081500Z-asked.mcap"
+    monkeypatch.setattr(sys, "argv", ["diagnosing", str(made)])
+    for owner, name in ((os, "nice"), (os, "sched_setscheduler"), (signal, "signal")):
+        monkeypatch.setattr(owner, name, lambda *_: None)
+    monkeypatch.setattr(diagnosing, "make", lambda recording: finding.begun(recording, state, "so it is"))
+    caplog.set_level("INFO")
+    assert diagnosing.main() == 0
+    assert [record.levelname for record in caplog.records] == [level]
+
+
 def test_a_diagnosis_is_one_line_in_the_daemons_log(tmp_path):
     """Not also two about the gaps of its recording, of samples and of frames."""
     made, source = tmp_path / "elbow-20260105T081500Z-asked.mcap", jointfile.load_text(ELBOW)

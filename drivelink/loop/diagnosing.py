@@ -224,7 +224,7 @@ def _error(part: Record, joint: JointFile, outcome: Diagnosis, held_from: int) -
 def main() -> int:
     """Diagnose one recording; whatever comes of it lies beside it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal, for the daemon: the black box ends this
-    log_to_stderr(logging.WARNING)
+    log_to_stderr(logging.INFO)
     os.nice(19)
     with suppress(OSError, AttributeError):  # not every system has it
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
@@ -240,7 +240,8 @@ def main() -> int:
     except RecordingError as error:  # the disk is full
         _LOG.error("%s: %s", found["joint"], error)
         return error.exit_status
-    _LOG.warning("%s: %s", found["joint"], found["sentence"])
+    level = logging.INFO if found["state"] == finding.NOTHING else logging.WARNING
+    _LOG.log(level, "%s: %s", found["joint"], found["sentence"])
     return 0
 
 

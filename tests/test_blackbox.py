@@ -35,7 +35,7 @@ from drivelink.pubsub.feed import DECODERS
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, read_messages, recorded_cycles
-from drivelink.recording.messages import estimate_encoder
+from drivelink.recording.messages import Encoders
 from drivelink.recording.playback import open_playback
 from estimator.sample import Sample, Status, TransmissionEstimate
 
@@ -317,7 +317,7 @@ def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path, capsys
     assert len(cycles) > 100
     assert any(m.topic == "/elbow/can" for m in read_messages(made[0]))
     joint = jointfile.parse(text)
-    encode = estimate_encoder(2, joint.bus.period_s)
+    encode = Encoders(2, joint.bus.period_s).estimate
     ticks = [played.tick for played in open_playback(made[0], joint, tmp_path)]
     again = [encode(DECODERS["estimate"](tick.estimate_payload)) for tick in ticks]
     recorded = [m.data for m in read_messages(made[0], frozenset({"estimate"}))]

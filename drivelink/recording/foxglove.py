@@ -41,14 +41,10 @@ def write_layouts(joint: JointFile, folder: Path) -> list[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     plots = _plots(len(joint.motor))
-    made = []
-    for name, text in (
-        ("foxglove.json", _foxglove(joint.name, plots)),
-        ("plotjuggler.xml", _plotjuggler(joint.name, plots)),
-    ):
+    made = {"foxglove.json": _foxglove(joint.name, plots), "plotjuggler.xml": _plotjuggler(joint.name, plots)}
+    for name, text in made.items():
         write_whole(folder / name, text, force=True)
-        made.append(folder / name)
-    return made
+    return [folder / name for name in made]
 
 
 def _foxglove(joint: str, plots: Sequence[tuple[str, str, list[str]]]) -> str:

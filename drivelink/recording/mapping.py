@@ -135,17 +135,12 @@ def _read_side(path: Path) -> bytes | None:
     return None
 
 
-_UNITS = {
-    Signal.MOTOR_POSITION: "rad",
-    Signal.MOTOR_VELOCITY: "rad/s",
-    Signal.MOTOR_TORQUE: "Nm",
-    Signal.LINK_POSITION: "rad",
-    Signal.LINK_VELOCITY: "rad/s",
-    Signal.VELOCITY_CHECK: "rad/s",
-    Signal.SECOND_POSITION: "rad",
-    Signal.FOLLOWING_ERROR: "rad",
-    Signal.POSITION_DEMAND: "rad",
-}
+_POSITIONS = (
+    Signal.MOTOR_POSITION, Signal.LINK_POSITION, Signal.SECOND_POSITION, Signal.FOLLOWING_ERROR,
+    Signal.POSITION_DEMAND,
+)  # fmt: skip
+_VELOCITIES = Signal.MOTOR_VELOCITY, Signal.LINK_VELOCITY, Signal.VELOCITY_CHECK
+_UNITS = dict.fromkeys(_POSITIONS, "rad") | dict.fromkeys(_VELOCITIES, "rad/s") | {Signal.MOTOR_TORQUE: "Nm"}
 
 
 def dbc_text(joint: str, layouts: Iterable[NodeLayout]) -> str:

@@ -83,7 +83,7 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
                 if messages.broken:
                     raise _BrokenError
         except _BrokenError:
-            _warn_once(path, path.stat().st_mtime_ns)
+            _warn_once(path.stat().st_mtime_ns, "%s: truncated or damaged: read up to the damage", path)
 
 
 def read_attachment(path: Path, name: str) -> bytes | None:
@@ -144,9 +144,9 @@ def _attached(body: bytes) -> tuple[str, bytes]:
 
 
 @lru_cache(maxsize=16)
-def _warn_once(path: Path, _mtime_ns: int) -> None:
+def _warn_once(_mtime_ns: int, text: str, *about: object) -> None:
     """A file is read several times: for its joint, its mapping, its samples."""
-    _LOG.warning("%s: truncated or damaged: read up to the damage", path)
+    _LOG.warning(text, *about)
 
 
 def warn_of_another(path: Path, joint: str) -> None:
@@ -154,12 +154,8 @@ def warn_of_another(path: Path, joint: str) -> None:
     if message := next(read_messages(path, frozenset({"sample"})), None):
         recorded = message.topic.strip("/").rpartition("/")[0]
         if recorded != joint:
-            _warn_of_another_once(path, recorded, joint)
-
-
-@lru_cache(maxsize=16)
-def _warn_of_another_once(path: Path, recorded: str, joint: str) -> None:
-    _LOG.warning('%s: recorded of "%s", while the joint file is of "%s"', path, recorded[:80], joint)
+            text = '%s: recorded of "%s", while the joint file is of "%s"'
+            _warn_once(0, text, path, recorded[:80], joint)
 
 
 class _BrokenError(Exception):

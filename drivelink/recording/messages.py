@@ -80,41 +80,32 @@ def _estimate_names(motors: int) -> tuple[str, ...]:
     return (*(name for name in estimate_columns(motors) if name != "observable"), *_band_columns(motors))
 
 
-def sample_encoder(motors: int, period_s: float) -> Callable[[Sample], bytes]:
-    """Return the function that makes a sample's message."""
-    fill = _template(("sequence",), (), sample_columns(motors))
+class Encoders:
+    """Makes the messages of a joint's samples, estimates and external torques."""
 
-    def encode(sample: Sample) -> bytes:
-        return fill((sample.sequence,), sample_row(sample, period_s))
+    def __init__(self, motors: int, period_s: float) -> None:
+        self._period_s = period_s
+        self._sample = _template(("sequence",), sample_columns(motors))
+        self._estimate = _template(("sequence", "status", "valid", "observable"), _estimate_names(motors))
+        self._external = _template(("sequence", "status", "valid", "contact"), _EXTERNAL_NAMES)
 
-    return encode
+    def sample(self, sample: Sample) -> bytes:
+        """Return a sample's message."""
+        return self._sample((sample.sequence,), sample_row(sample, self._period_s))
 
-
-def estimate_encoder(motors: int, period_s: float) -> Callable[[EstimateMessage], bytes]:
-    """Return the function that makes an estimate's message."""
-    fill = _template(("sequence", "status"), ("valid", "observable"), _estimate_names(motors))
-
-    def encode(message: EstimateMessage) -> bytes:
-        status = message.status
-        totals = (message.flexibility_torque_nm, message.stiffness_nm_rad, message.stiffness_std_nm_rad)
-        each = (value for one in message.transmissions for value in one)
+    def estimate(self, message: EstimateMessage) -> bytes:
+        """Return an estimate's message."""
+        sequence, _, status, *totals, transmissions = message
+        each = (value for one in transmissions for value in one)
         flags = _JSON[bool(status & _VALID)], _JSON[bool(status & _OBSERVABLE)]
-        row = (message.sequence * period_s, *totals, *each, *_band_row(message))
-        return fill((message.sequence, status, *flags), row)
+        row = (sequence * self._period_s, *totals, *each, *_band_row(message))
+        return self._estimate((sequence, status, *flags), row)
 
-    return encode
-
-
-def external_encoder(period_s: float) -> Callable[[ExternalMessage], bytes]:
-    """Return the function that makes an external torque's message."""
-    fill = _template(("sequence", "status"), ("valid", "contact"), _EXTERNAL_NAMES)
-
-    def encode(message: ExternalMessage) -> bytes:
-        torque, std = message.external_torque_nm, message.external_torque_std_nm
+    def external(self, message: ExternalMessage) -> bytes:
+        """Return an external torque's message."""
+        sequence, _, status, torque, std = message
         flags = _JSON[message.valid], _JSON[message.contact]
-        return fill((message.sequence, message.status, *flags), (message.sequence * period_s, torque, std))
-
-    return encode
+        return self._external((sequence, status, *flags), (sequence * self._period_s, torque, std))
 
 
 def events_of(status: bytes) -> list[tuple[float, str]]:
@@ -202,10 +193,10 @@ def _numbers(names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _template(
-    whole: tuple[str, ...], flags: tuple[str, ...], names: tuple[str, ...]
+    head: tuple[str, ...], names: tuple[str, ...]
 ) -> Callable[[tuple[int | str, ...], tuple[float, ...]], bytes]:
-    """Template of a JSON object: integers, booleans as JSON, then floats in shortest exact form."""
-    fields = [f'"{name}":%s' for name in (*whole, *flags)] + [f'"{name}":%r' for name in names]
+    """Template of a JSON object: integers and booleans as JSON, then floats in shortest exact form."""
+    fields = [f'"{name}":%s' for name in head] + [f'"{name}":%r' for name in names]
     template = "{" + ",".join(fields) + "}"
 
     def fill(head: tuple[int | str, ...], values: tuple[float, ...]) -> bytes:

@@ -5,6 +5,8 @@ import math
 import time
 from array import array
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from functools import partial
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -101,40 +103,30 @@ def open_playback(
     if path.suffix.lower() == ".mcap":
         warn_of_another(path, joint.name)
         recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)
-        state = _state(path, joint)
-        after = lambda pipeline: _after(state, recorded, pipeline, path)  # noqa: E731
-        return Playback(joint, joint.bus.period_s, None, after)
+        resumed = partial(_resumed, recorded, path=path, joint=joint)
+        return Playback(joint, joint.bus.period_s, None, resumed)
     record = read(path, joint, keep_nan=True, names=names)
     stamps = (round(time_s * 1e9) for time_s in record.time_s.tolist())
     cycles = (Cycle(one.sequence, at, one, 0) for one, at in zip(record.samples(), stamps, strict=True))
     return Playback(joint, record.period_s, len(record), lambda _: cycles, record.start_s)
 
 
-def _state(path: Path, joint: JointFile) -> bytes | None:
-    """Return the state in which a recording's estimator begins; None: none of this joint file's model."""
-    state = read_attachment(path, SNAPSHOT)
-    if state is None:
-        return None
-    try:
-        own = joint_of(path, None).joint
-    except DrivelinkError:
-        own = None
-    if own is None or (own.model(), own.estimator) != (joint.model(), joint.estimator):
-        _LOG.warning("%s: the estimator begins anew: its state is of another model or other settings", path)
-        return None
-    return state
-
-
-def _after(
-    state: bytes | None, cycles: Iterable[Cycle], pipeline: JointPipeline, path: Path
+def _resumed(
+    cycles: Iterable[Cycle], pipeline: JointPipeline, path: Path, joint: JointFile
 ) -> Iterable[Cycle]:
     """Return the cycles after a recorded state, which the pipeline takes; all of them where there is none.
 
-    A state of another version of drivelink is not used.
+    A state of another model, of other settings, or of another version of drivelink is not used.
     """
+    state = read_attachment(path, SNAPSHOT)
     if state is None:
         return cycles
+    own = None
+    with suppress(DrivelinkError):
+        own = joint_of(path, None).joint
     try:
+        if own is None or (own.model(), own.estimator) != (joint.model(), joint.estimator):
+            raise ValueError("its state is of another model or other settings")
         last = pipeline.restore(state)
     except ValueError as error:
         _LOG.warning("%s: the estimator begins anew: %s", path, error)

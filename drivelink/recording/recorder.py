@@ -31,7 +31,8 @@ from estimator.sample import Sample
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_SNAPSHOTS = 2  # that wait: each has some megabytes
+# Messages of a key that wait; a snapshot has some megabytes.
+_DEPTHS = dict.fromkeys(("sample", "estimate", "external"), MAX_UNREAD) | {"snapshot": 2}
 _FLUSH_S = 1.0
 _POLL_S = 0.005
 _AT_ONCE = 1000  # messages of a key, or frames, until the file has its turn
@@ -77,17 +78,13 @@ class ZenohTap:
         self._silent_s = 0.0  # of the silences that are over
         key = f"{joint.zenoh.prefix}/{joint.name}"
         ring = zenoh.handlers.RingChannel
-        handlers = {"sample": self._sample, "estimate": self._estimate, "external": self._external}
-        self._streams: list[tuple[Any, Callable[[zenoh.Sample], None]]] = [
-            (session.declare_subscriber(f"{key}/{name}", ring(MAX_UNREAD)), handle)
-            for name, handle in handlers.items()
+        self._streams: list[tuple[str, Any]] = [
+            (name, session.declare_subscriber(f"{key}/{name}", ring(depth)))
+            for name, depth in _DEPTHS.items()
             if name in sink.wants
         ]
-        if "snapshot" in sink.wants:
-            plain = session.declare_subscriber(f"{key}/snapshot", ring(_SNAPSHOTS))
-            self._streams.append((plain, self._snapshot))
         for name in ("status", "model") if "document" in sink.wants else ():
-            self._streams.append((follow_document(session, f"{key}/{name}", 16), self._document))
+            self._streams.append((name, follow_document(session, f"{key}/{name}", 16)))
 
         # In zenoh's thread (indirect=False), which never keeps the process from ending.
         heard = zenoh.handlers.Callback(self._identity.heard, indirect=False)
@@ -111,7 +108,7 @@ class ZenohTap:
     def poll(self) -> bool:
         """Store what has come, but not all at once; return whether there is more."""
         now_s, more = time.monotonic(), False
-        for subscriber, take in self._streams:
+        for name, subscriber in self._streams:
             for number, sample in enumerate(waiting(subscriber, _AT_ONCE), 1):
                 more = more or number == _AT_ONCE
                 if not self._identity.accepts(source_of(sample), now_s - self._heard_s > _STALE_S):
@@ -119,7 +116,7 @@ class ZenohTap:
                 self._silent_s += self._silence(now_s)
                 self._heard_s = now_s
                 try:
-                    take(sample)
+                    self._take(name, sample.payload.to_bytes())
                 except ZenohError:
                     self._impossible += 1
         return more
@@ -129,43 +126,38 @@ class ZenohTap:
 
     def close(self) -> None:
         """Stop listening."""
-        for subscriber in (self._tokens, *(subscriber for subscriber, _ in self._streams)):
+        for subscriber in (self._tokens, *(subscriber for _, subscriber in self._streams)):
             subscriber.undeclare()
 
-    def _sample(self, message: zenoh.Sample) -> None:
-        sample, stamp_ns = DECODERS["sample"](message.payload.to_bytes())
-        self._require_motors(len(sample.motor_position_rad))
-        self._count("sample", sample.sequence)
-        self._gate.sample(self, sample, stamp_ns)
+    def _take(self, name: str, payload: bytes) -> None:
+        """Store a message.
 
-    def _estimate(self, message: zenoh.Sample) -> None:
-        estimate = DECODERS["estimate"](message.payload.to_bytes())
-        self._require_motors(len(estimate.transmissions))
-        self._count("estimate", estimate.sequence)
-        self._sink.estimate(estimate)
+        Raises:
+            ZenohError: it is malformed, or of another joint.
+        """
+        if name == "snapshot":
+            if not 8 < len(payload) <= MAX_BLOCK_BYTES:
+                raise ZenohError(f"expected a snapshot of at most {MAX_BLOCK_BYTES >> 20} MiB")
+            self._sink.snapshot(payload[8:])
+            return
+        message = DECODERS[name](payload)
+        if name == "sample":
+            self._count(name, message.sample.sequence, len(message.sample.motor_position_rad))
+            self._gate.sample(self, *message)
+        elif name == "estimate":
+            self._count(name, message.sequence, len(message.transmissions))
+            self._sink.estimate(message)
+        elif name == "external":
+            self._sink.external(message)
+        else:
+            self._sink.document(name, json.dumps(message).encode(), time.time_ns())
 
-    def _external(self, message: zenoh.Sample) -> None:
-        self._sink.external(DECODERS["external"](message.payload.to_bytes()))
-
-    def _snapshot(self, message: zenoh.Sample) -> None:
-        payload = message.payload.to_bytes()
-        if not 8 < len(payload) <= MAX_BLOCK_BYTES:
-            raise ZenohError(f"expected a snapshot of at most {MAX_BLOCK_BYTES >> 20} MiB")
-        self._sink.snapshot(payload[8:])
-
-    def _document(self, message: zenoh.Sample) -> None:
-        name = str(message.key_expr).rpartition("/")[2]
-        document = DECODERS[name](message.payload.to_bytes())
-        self._sink.document(name, json.dumps(document).encode(), time.time_ns())
-
-    def _count(self, kind: str, sequence: int) -> None:
-        """Count the cycles since the last one of its kind."""
-        self.missed[kind] += max(0, sequence - self._sequence.get(kind, sequence) - 1)
-        self._sequence[kind] = sequence
-
-    def _require_motors(self, motors: int) -> None:
+    def _count(self, kind: str, sequence: int, motors: int) -> None:
+        """Count the cycles since the last one of its kind; refuse one of another number of motors."""
         if motors != self._motors:
             raise ZenohError(f"expected {self._motors} motors, got {motors}")
+        self.missed[kind] += max(0, sequence - self._sequence.get(kind, sequence) - 1)
+        self._sequence[kind] = sequence
 
 
 class BusTap:

@@ -6,7 +6,7 @@ A sink buffers in memory; `flush`, called once a second, writes whole blocks to 
 import io
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,12 +25,10 @@ from drivelink.recording.mcapfile import SNAPSHOT
 from drivelink.recording.messages import (
     SCHEMA_NAMES,
     TOPICS,
-    estimate_encoder,
+    Encoders,
     events_of,
-    external_encoder,
     log_message,
     message_schema,
-    sample_encoder,
 )
 from drivelink.version import __version__
 from estimator.sample import Sample
@@ -212,10 +210,7 @@ class MessageSink(Sink):
 
     def set_up(self, joint: JointFile) -> None:
         """Make the encoders of a joint."""
-        motors, period_s = len(joint.motor), joint.bus.period_s
-        self._encode_sample: Callable[[Sample], bytes] = sample_encoder(motors, period_s)
-        self._encode_estimate = estimate_encoder(motors, period_s)
-        self._encode_external = external_encoder(period_s)
+        self._encode = Encoders(len(joint.motor), joint.bus.period_s)
         self._name, self._logged_s = joint.name, 0.0  # time of the last event that was written
 
     def _put(self, topic: str, stamp_ns: int, data: bytes) -> None:
@@ -223,17 +218,17 @@ class MessageSink(Sink):
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
         """Store what was measured at one SYNC."""
-        self._put("sample", stamp_ns, self._encode_sample(sample))
+        self._put("sample", stamp_ns, self._encode.sample(sample))
         self.counts["sample"] += 1
 
     def estimate(self, message: EstimateMessage) -> None:
         """Store one estimate."""
-        self._put("estimate", message.stamp_ns, self._encode_estimate(message))
+        self._put("estimate", message.stamp_ns, self._encode.estimate(message))
         self.counts["estimate"] += 1
 
     def external(self, message: ExternalMessage) -> None:
         """Store one external torque."""
-        self._put("external", message.stamp_ns, self._encode_external(message))
+        self._put("external", message.stamp_ns, self._encode.external(message))
         self.counts["external"] += 1
 
     def document(self, name: str, payload: bytes, stamp_ns: int) -> None:

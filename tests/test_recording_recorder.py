@@ -140,7 +140,7 @@ def test_estimates_that_were_lost_on_the_way_are_said(tmp_path, monkeypatch):
         recorder.taps.append(tap := ZenohTap(session, joint, sink))
         for kind, numbers in (("sample", (5, 6, 7, 8, 9)), ("estimate", (5, 8, 9, 3, 4))):  # and began again
             for number in numbers:
-                tap._count(kind, number)
+                tap._count(kind, number, 2)
         summary = _Summary(tmp_path / "a.mcap", recorder)
         assert summary.text().endswith("s, 2 cycles without estimate")
         assert {k: n for k, n in summary.document().items() if k.startswith("cycles_without")} == {
@@ -157,7 +157,7 @@ def test_a_daemon_that_fell_silent_is_said(tmp_path, monkeypatch):
     session: Any = MagicMock()
     with Recorder(sink := open_sink(tmp_path / "a.mcap", joint, ""), []) as recorder:
         recorder.taps.append(tap := ZenohTap(session, joint, sink))
-        tap._streams = [(stream := MagicMock(), lambda _: None)]
+        tap._streams, tap._take = [("estimate", stream := MagicMock())], MagicMock()
         tap._identity = MagicMock(refused=0)
         for after_s, silent in ((0.0, ""), (0.9, ""), (3.0, "3"), (0.5, "3"), (2.0, "5")):
             now[0] += after_s
@@ -186,9 +186,8 @@ def test_what_comes_faster_than_it_is_used_keeps_nobody_from_flushing_and_ending
             tap._source = MagicMock(wait=more, receive=lambda: [CanFrame(1, b"", 1)] * 64)
         else:
             tap = ZenohTap(session, joint, sink) if what == "recorder" else Watcher(session)
-            stream = MagicMock(try_recv=more)
-            tap._streams = [(stream, lambda _: None) if what == "recorder" else ("estimate", stream)]
-            monkeypatch.setattr(Watcher, "_take", lambda *_: None)
+            tap._streams = [("estimate", MagicMock(try_recv=more))]
+            monkeypatch.setattr(type(tap), "_take", lambda *_: None)
         tap.poll()
         if what != "monitor":
             recorder.taps.append(tap)

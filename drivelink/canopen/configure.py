@@ -51,15 +51,11 @@ class Configurator:
         self._send = send
         self.bus: BusSection = joints[0].bus
         self._roles = roles_by_node(joints, base_dirs)
+        self.nodes = tuple(self._roles)  # node ids, in the order of the joint files
         self.layouts: dict[int, NodeLayout] = {}
         self.drop_others = False
         self._sessions: dict[int, Session[NodeLayout]] = {}
         self._ended: list[tuple[int, NodeLayout | DriveError]] = []  # since the last poll
-
-    @property
-    def nodes(self) -> tuple[int, ...]:
-        """Node ids, in the order of the joint files."""
-        return tuple(self._roles)
 
     def program(self, node: int, *, start: bool, stopped: bool = False) -> Program[NodeLayout]:
         """Return the SDO program that configures a node; a stopped node is woken first."""
@@ -75,16 +71,12 @@ class Configurator:
 
     def start(self, node: int, *, stopped: bool = False) -> None:
         """Start to configure a node beside the loop; restart if it is already being configured."""
-        self._sessions[node] = Session(
-            self.program(node, start=True, stopped=stopped),
-            self._send,
-            timeout_s=self.bus.sdo_timeout_s,
-            retries=self.bus.sdo_retries,
-        )
+        program = self.program(node, start=True, stopped=stopped)
+        self._sessions[node] = self.run(program, self.bus.sdo_retries)
 
-    def run(self, program: Program[T]) -> Session[T]:
-        """Return the session of a program whose requests are not repeated; the caller feeds and polls it."""
-        return Session(program, self._send, timeout_s=self.bus.sdo_timeout_s, retries=0)
+    def run(self, program: Program[T], retries: int = 0) -> Session[T]:
+        """Return the session of a program; the caller feeds and polls it."""
+        return Session(program, self._send, timeout_s=self.bus.sdo_timeout_s, retries=retries)
 
     @property
     def busy(self) -> bool:

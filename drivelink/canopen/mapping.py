@@ -96,11 +96,6 @@ class Mapper:
                 self._drop(available, refused)
         return (yield from self._read_back([assignment.tpdo.number for assignment in assignments]))
 
-    @property
-    def node(self) -> int:
-        """Node id."""
-        return self.role.node_id
-
     def _drop(self, available: dict[Signal, list[MappedObject]], refused: _ObjectRefused) -> None:
         signal = refused.candidate.signal
         index, subindex = refused.candidate.address
@@ -118,13 +113,10 @@ class Mapper:
 
     def _apply(self, assignment: Assignment) -> Program[None]:
         """Configure one TPDO, if necessary."""
-        tpdo = assignment.tpdo
-        entries = tpdo.entries
-        if assignment.objects is not None:
-            entries = tuple((*candidate.address, candidate.bits) for candidate in assignment.objects)
+        tpdo, entries = assignment.tpdo, assignment.entries
         mine = {chosen for number, chosen in self._chosen.items() if number != tpdo.number}
         mine |= {other.cob_id for other in self.tpdos if other.enabled and other.number != tpdo.number}
-        cob_id = choose_cob_id(self.node, tpdo, self.taken | mine)
+        cob_id = choose_cob_id(self.role.node_id, tpdo, self.taken | mine)
         self._chosen[tpdo.number] = cob_id
         if tpdo.enabled and tpdo.cob_id == cob_id and tpdo.transmission_type == 1 and tpdo.entries == entries:
             return
@@ -140,7 +132,7 @@ class Mapper:
     ) -> Program[Tpdo]:
         if not self._pre_operational:
             self._pre_operational = True
-            yield Nmt(self.node, NMT_PRE_OPERATIONAL)
+            yield Nmt(self.role.node_id, NMT_PRE_OPERATIONAL)
             yield Pause(SETTLE_S)
         no_rtr = tpdo.cob & NO_RTR
         try:
@@ -168,13 +160,13 @@ class Mapper:
         """Write, with retries for a node that is slow to enter pre-operational."""
         while True:
             try:
-                yield Write(self.node, index, subindex, value, size)
+                yield Write(self.role.node_id, index, subindex, value, size)
                 return
             except SdoAbort as abort:
                 if abort.code not in _NOT_NOW or self._patience_s <= 0:
                     raise
             self._patience_s -= _STATE_POLL_S
-            yield Nmt(self.node, NMT_PRE_OPERATIONAL)  # the first one may have been lost
+            yield Nmt(self.role.node_id, NMT_PRE_OPERATIONAL)  # the first one may have been lost
             yield Pause(_STATE_POLL_S)
 
     def _cob(self, tpdo: Tpdo, value: int) -> Program[None]:
@@ -208,7 +200,7 @@ class Mapper:
         """Set transmission at every SYNC, without inhibit time or event timer. A TPDO that cannot be
         synchronous gets an event timer of one period.
         """
-        start = yield from read_optional(self.node, tpdo.communication, 6)
+        start = yield from read_optional(self.role.node_id, tpdo.communication, 6)
         on_sync = yield from self._ask(tpdo, 2, tpdo.transmission_type, 1)
         every_ms = (
             0 if on_sync or tpdo.transmission_type in SYNC_TYPES else max(1, round(1e3 * self.period_s))
@@ -264,19 +256,20 @@ class Mapper:
         if abort.code != _NO_SUBINDEX:
             return abort.code == _TOO_MANY
         try:
-            yield Read(self.node, tpdo.mapping, position)
+            yield Read(self.role.node_id, tpdo.mapping, position)
         except SdoAbort:
             return True
         return False
 
     def _restore(self, tpdo: Tpdo) -> Program[None]:
         """Restore mapping and identifier after a refusal."""
+        node = self.role.node_id
         try:
             if tpdo.known and not self._is_fixed(tpdo):
-                yield Write(self.node, tpdo.mapping, 0, 0, 1)
+                yield Write(node, tpdo.mapping, 0, 0, 1)
                 for position, (index, subindex, bits) in enumerate(tpdo.entries, start=1):
-                    yield Write(self.node, tpdo.mapping, position, index << 16 | subindex << 8 | bits, 4)
-                yield Write(self.node, tpdo.mapping, 0, len(tpdo.entries), 1)
+                    yield Write(node, tpdo.mapping, position, index << 16 | subindex << 8 | bits, 4)
+                yield Write(node, tpdo.mapping, 0, len(tpdo.entries), 1)
             yield from self._cob(tpdo, tpdo.cob)
         except SdoAbort as abort:
             self.findings.warn(self.role.subject, f"TPDO{tpdo.number} could not be put back: {abort}")
@@ -287,7 +280,7 @@ class Mapper:
     def _read_back(self, numbers: Iterable[int]) -> Program[tuple[TpdoLayout, ...]]:
         used: list[Tpdo] = []
         for number in numbers:
-            tpdo = yield from read_tpdo(self.node, number, exactly=True)
+            tpdo = yield from read_tpdo(self.role.node_id, number, exactly=True)
             if tpdo is None or not tpdo.enabled:
                 raise DriveError(f"{self.role.subject}: TPDO{number} stays disabled after its configuration")
             self._replace(replace(tpdo, fixed=self._is_fixed(tpdo)))

@@ -44,11 +44,6 @@ class PassiveConfigurator:
         self.poll(0.0)
 
     @property
-    def nodes(self) -> tuple[int, ...]:
-        """Node ids, in the order of the joint files."""
-        return tuple(self._nodes)
-
-    @property
     def busy(self) -> bool:
         """Whether the mapping of any node is still unknown."""
         return bool(self.missing)
@@ -59,7 +54,7 @@ class PassiveConfigurator:
         return frozenset(
             node
             for node in self.layouts
-            if node not in self.doubts and not (node in self._nodes and self._nodes[node].being_mapped)
+            if node not in self.doubts and not (node in self._nodes and self._nodes[node].listener.is_mapping)
         )
 
     def unasked(self, node: int) -> int:
@@ -113,7 +108,7 @@ class PassiveConfigurator:
             if cob_id not in one.heard and one.role.node_id in self.missing:
                 one.listener.changes += 1  # the message can be more specific now
             one.heard[cob_id] = len(data)
-        before, one.state = one.state, (one.listener.changes, one.being_mapped)
+        before, one.state = one.state, (one.listener.changes, one.listener.is_mapping)
         return one.state != before
 
     def poll(self, now_s: float) -> list[tuple[int, NodeLayout | DriveError]]:

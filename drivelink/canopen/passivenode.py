@@ -1,8 +1,7 @@
 """What is known of a node that another master configures: mapping, units, and whether to trust them."""
 
-from collections.abc import Container, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
-from functools import partial
 
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.layout import NodeLayout, Offer, Role, Signal
@@ -42,9 +41,12 @@ class PassiveNode:
         self._sheet = load_eds(role.eds, role.node_id) if role.eds is not None else None
         self._units = {address for vendor in VENDORS.values() for address in unit_objects(role, vendor)}
         followed = self._units.union(_COMMUNICATION, _STORED)
-        self.listener = SdoSniffer(partial(_interesting, followed), bus.sdo_timeout_s)
+        self.listener = SdoSniffer(
+            lambda *address: address[1] <= _MOST_ENTRIES if is_mapping(address) else address in followed,
+            bus.sdo_timeout_s,
+        )
         self.seen_changes = -1
-        self.state = (-1, False)  # changes and `being_mapped` after its last frame
+        self.state = (-1, False)  # changes and `is_mapping` of the listener after its last frame
         self.adopted: NodeLayout | None = None
         self.restarted = False  # or it may have
         self.stored = False  # its own mapping may be another one than the joint file states
@@ -103,11 +105,6 @@ class PassiveNode:
             "two different answers, or was given up: its frames are not used until the object is read or "
             "written again; does another device answer for it?"
         )
-
-    @property
-    def being_mapped(self) -> bool:
-        """Whether the master is changing its mapping now."""
-        return self.listener.is_mapping
 
     def layout(self) -> tuple[NodeLayout, str]:
         """Return the best known layout, and why it is not trusted (empty: it is).
@@ -258,12 +255,6 @@ class PassiveNode:
             f"{role.subject} ({role.key}): its mapping is not known: expected {master} to write it or read "
             f"it back while this listens, or {self._keys()} or eds in the joint file"
         ) + (f"; it sends {heard}" if heard else "")
-
-
-def _interesting(followed: Container[Address], index: int, subindex: int) -> bool:
-    if is_mapping((index, subindex)):
-        return subindex <= _MOST_ENTRIES
-    return (index, subindex) in followed
 
 
 def _sent(tpdos: Iterable[Tpdo]) -> tuple[Tpdo, ...]:

@@ -261,6 +261,13 @@ class Assignment:
     tpdo: Tpdo  # as it is in the node
     objects: tuple[MappedObject, ...] | None  # objects to map in order; None: keep its mapping
 
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """What is mapped then, in order."""
+        if self.objects is None:
+            return self.tpdo.entries
+        return tuple((*candidate.address, candidate.bits) for candidate in self.objects)
+
 
 def pack(objects: Iterable[MappedObject], most: int = FRAME_BITS) -> list[tuple[MappedObject, ...]]:
     """Return the frames of at most eight bytes and `most` objects, first fit, in the order of importance."""

@@ -33,46 +33,6 @@ def abort_text(code: int) -> str:
     return f"0x{code:08X}" + (f" ({text})" if text else "")
 
 
-def _name(index: int, subindex: int) -> str:
-    return f"0x{index:04X}:{subindex:02X}"
-
-
-class SdoAbort(DriveError):  # noqa: N818 - the protocol's own word
-    """The drive refused a transfer."""
-
-    def __init__(self, node: int, index: int, subindex: int, code: int, *, writing: bool = False) -> None:
-        what = "refused writing" if writing else "refused reading"
-        super().__init__(f"node {node} {what} {_name(index, subindex)}: SDO abort {abort_text(code)}")
-        self.node = node  # node id
-        self.index = index  # object
-        self.subindex = subindex  # of it
-        self.code = code  # abort code
-
-
-class SdoBreach(SdoAbort):
-    """The drive violated the protocol; the client aborted the transfer."""
-
-    def __init__(self, node: int, index: int, subindex: int, code: int, what: str) -> None:
-        super().__init__(node, index, subindex, code)
-        text = f"node {node} answers {_name(index, subindex)} against the protocol: {what}"
-        self.args = (f"{text}; SDO abort {abort_text(code)}",)
-
-
-class SdoTimeout(DriveError):  # noqa: N818 - as above
-    """The drive did not answer."""
-
-    def __init__(
-        self, node: int, index: int, subindex: int, timeout_s: float, attempts: int, *, begun: bool = False
-    ) -> None:
-        does, what = ("end its answer", "no end") if begun else ("answer", "no answer")
-        super().__init__(
-            f"node {node} does not {does}: SDO {_name(index, subindex)}, {what} within {timeout_s:g} s, "
-            f"the last {attempts} time{'s' if attempts > 1 else ''} it was asked"
-        )
-        self.node = node  # node id
-        self.index = index  # object it was asked for
-
-
 class Unsized(bytes):
     """The four bytes of an answer without size indication."""
 
@@ -115,6 +75,42 @@ class Pause:
 
 Request = Read | Write | Nmt | Pause
 Program = Generator[Request, bytes, T]
+
+
+def _name(request: Read | Write) -> str:
+    return f"0x{request.index:04X}:{request.subindex:02X}"
+
+
+class SdoAbort(DriveError):  # noqa: N818 - the protocol's own word
+    """The drive refused a transfer."""
+
+    def __init__(self, request: Read | Write, code: int) -> None:
+        what = "writing" if isinstance(request, Write) else "reading"
+        super().__init__(f"node {request.node} refused {what} {_name(request)}: SDO abort {abort_text(code)}")
+        self.index = request.index  # object
+        self.subindex = request.subindex  # of it
+        self.code = code  # abort code
+
+
+class SdoBreach(SdoAbort):
+    """The drive violated the protocol; the client aborted the transfer."""
+
+    def __init__(self, request: Read | Write, code: int, what: str) -> None:
+        super().__init__(request, code)
+        text = f"node {request.node} answers {_name(request)} against the protocol: {what}"
+        self.args = (f"{text}; SDO abort {abort_text(code)}",)
+
+
+class SdoTimeout(DriveError):  # noqa: N818 - as above
+    """The drive did not answer."""
+
+    def __init__(self, request: Read | Write, timeout_s: float, attempts: int, *, begun: bool) -> None:
+        does, what = ("end its answer", "no end") if begun else ("answer", "no answer")
+        super().__init__(
+            f"node {request.node} does not {does}: SDO {_name(request)}, {what} within {timeout_s:g} s, "
+            f"the last {attempts} time{'s' if attempts > 1 else ''} it was asked"
+        )
+        self.index = request.index  # object it was asked for
 
 
 def read_number(node: int, index: int, subindex: int) -> Program[int]:
@@ -163,7 +159,7 @@ class _Transfer:
         command = data[0] >> 5
         ours = data[1] | data[2] << 8 == request.index and data[3] == request.subindex
         if command == 4 and (ours or not any(data[1:4])):  # some servers abort without naming the object
-            raise self._abort(int.from_bytes(data[4:8], "little"))
+            raise SdoAbort(request, int.from_bytes(data[4:8], "little"))
         if self._segmented:
             return self._segment(data) if command == 0 else None
         if not ours:
@@ -180,37 +176,28 @@ class _Transfer:
         if data[0] & 0x01:
             self._declared = int.from_bytes(data[4:8], "little")
         if self._declared is not None and self._declared > request.most:
-            raise self._breach(_TOO_LONG, f"{self._declared} bytes, expected {request.most} at most")
+            raise SdoBreach(request, _TOO_LONG, f"{self._declared} bytes, expected {request.most} at most")
         self._most = request.most if self._declared is None else self._declared
         self._segmented = self.answered = True
         return b"\x60" + bytes(7)
 
     def _segment(self, data: bytes) -> bytes | None:
         if (data[0] >> 4) & 1 != self._toggle:
-            raise self._breach(_TOGGLE_ERROR, "a segment out of turn")
+            raise SdoBreach(self.request, _TOGGLE_ERROR, "a segment out of turn")
         part, last = data[1 : 8 - ((data[0] >> 1) & 7)], bool(data[0] & 0x01)
         self._buffer += part
         if len(self._buffer) > self._most:
-            raise self._breach(_TOO_LONG, f"more than {self._most} bytes")
+            raise SdoBreach(self.request, _TOO_LONG, f"more than {self._most} bytes")
         if last and self._declared is not None and len(self._buffer) < self._declared:
-            raise self._breach(_TOO_SHORT, f"{len(self._buffer)} bytes after declaring {self._declared}")
+            what = f"{len(self._buffer)} bytes after declaring {self._declared}"
+            raise SdoBreach(self.request, _TOO_SHORT, what)
         if last:
             self.result = bytes(self._buffer)
             return None
         if not part:
-            raise self._breach(_WRONG_LENGTH, "a segment without data that is not the last")
+            raise SdoBreach(self.request, _WRONG_LENGTH, "a segment without data that is not the last")
         self._toggle ^= 1
         return bytes([0x60 | self._toggle << 4]) + bytes(7)
-
-    def _abort(self, code: int) -> SdoAbort:
-        request = self.request
-        return SdoAbort(
-            request.node, request.index, request.subindex, code, writing=isinstance(request, Write)
-        )
-
-    def _breach(self, code: int, what: str) -> SdoBreach:
-        request = self.request
-        return SdoBreach(request.node, request.index, request.subindex, code, what)
 
 
 class Session(Generic[T]):
@@ -289,16 +276,9 @@ class Session(Generic[T]):
         else:
             self._transfer = None
             self._abort_transfer(transfer, _TIMED_OUT)
-            request = transfer.request
-            failure = SdoTimeout(
-                request.node,
-                request.index,
-                request.subindex,
-                self._timeout_s * (_TRANSFER_TIMEOUTS if transfer.answered else 1),
-                self._attempts,
-                begun=transfer.answered,
-            )
-            self._advance(now_s, failure)
+            begun = transfer.answered
+            waited_s = self._timeout_s * (_TRANSFER_TIMEOUTS if begun else 1)
+            self._advance(now_s, SdoTimeout(transfer.request, waited_s, self._attempts, begun=begun))
         return self.done
 
     def _advance(self, now_s: float, answer: bytes | Exception | None) -> None:

@@ -150,7 +150,7 @@ class PassiveFollower(MapFollower):
     ) -> None:
         super().__init__(configurator, assemblers, layouts, used)
         self._clock_may_be_set = clock_may_be_set
-        self._listener = configurator
+        self.listener = configurator  # hears what the nodes and their master say
         self._silent = max(2 * _LOOKS, round(_SILENT_S / configurator.bus.period_s))  # SYNCs
         self._heard = dict.fromkeys(assemblers, (0, 0))  # frames of a node, and the SYNC of the last one
         self._speaking: set[int] = set()  # since the last look, other than by PDOs
@@ -164,7 +164,7 @@ class PassiveFollower(MapFollower):
     @property
     def doubts(self) -> dict[int, str]:
         """Nodes whose frames are not used, and why."""
-        return {**self._listener.doubts, **self.refused}
+        return {**self.listener.doubts, **self.refused}
 
     def feed(self, cob_id: int, data: bytes, now_s: float, ahead: int = 0) -> None:
         """See `MapFollower.feed`."""
@@ -174,9 +174,9 @@ class PassiveFollower(MapFollower):
         if cob_id > 0x700 or 0x580 < cob_id < 0x600:
             self._speaking.add(cob_id & 0x7F)
             self._since_sync[cob_id & 0x7F] += 1
-        changed = self._listener.feed(cob_id, data, now_s)
+        changed = self.listener.feed(cob_id, data, now_s)
         if changed or any(assembler.untrusted for assembler in self._joints):
-            self._listener.poll(now_s)
+            self.listener.poll(now_s)
             self._judge()
 
     def sync(self) -> Sequence[Mismatch]:
@@ -187,13 +187,9 @@ class PassiveFollower(MapFollower):
 
     def lose_sight(self, nodes: Iterable[int] | None = None, why: str = "the bus was lost") -> None:
         """Handle a time in which nodes (None: all) may have restarted unheard."""
-        self._listener.lose_sight(nodes, why)
-        self._listener.poll(0.0)
+        self.listener.lose_sight(nodes, why)
+        self.listener.poll(0.0)
         self._judge()
-
-    def unasked(self, node: int) -> int:
-        """Return SDO answers for a node that belong to no request heard."""
-        return self._listener.unasked(node)
 
     def _trust(self, node: int) -> None:
         if node in self._assemblers[node].untrusted:
@@ -223,9 +219,9 @@ class PassiveFollower(MapFollower):
             self.lose_sight(silent, f"no frame of it was heard for {_SILENT_S:g} s")
 
     def _judge(self) -> None:
-        believed = self._listener.believed
+        believed = self.listener.believed
         for node, assembler in self._assemblers.items():
-            layout, before = self._listener.layouts[node], self._in_use[node]
+            layout, before = self.listener.layouts[node], self._in_use[node]
             if node not in believed:
                 self._due.pop(node, None)
                 assembler.distrust(node)

@@ -11,7 +11,6 @@ import gc
 import os
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivelink._core import LATEST
@@ -22,6 +21,14 @@ SWITCH_INTERVAL_S = 100e-6  # longest time for which another Python thread holds
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2  # mlockall(2)
 _PR_SET_TIMERSLACK = 29  # prctl(2)
+_NO_SCHEDULING = (
+    "no real-time scheduling (SCHED_FIFO is not permitted): jitter will be larger; "
+    "permit it with LimitRTPRIO=99 in the systemd unit, or `ulimit -r 99`"
+)
+_NO_LOCK = (
+    "memory is not locked (mlockall is not permitted): a page fault may delay a cycle; "
+    "permit it with LimitMEMLOCK=infinity in the systemd unit, or `ulimit -l unlimited`"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,12 +48,19 @@ def acquire(*, privileged: bool = True) -> RealTime:
     gc.collect()
     gc.freeze()
     gc.disable()
-    libc = ctypes.CDLL(None, use_errno=True)
+    libc = ctypes.CDLL(None)
     if hasattr(libc, "prctl"):
         libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)  # no timer slack (default 50 us)
-    lines: list[str] = []
-    scheduling = privileged and _attempt(_schedule, lines)
-    memory = privileged and _attempt(lambda: _lock_memory(libc), lines)
+    lines, scheduling, memory = [], False, False
+    if privileged:
+        try:  # threads and processes that it starts are ordinary ones
+            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+            scheduling = True
+        except OSError:
+            lines.append(_NO_SCHEDULING)
+        memory = libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) == 0
+        if not memory:
+            lines.append(_NO_LOCK)
     return RealTime(scheduling=scheduling, memory=memory, lines=tuple(lines), switch_interval_s=before)
 
 
@@ -59,36 +73,6 @@ def release(obtained: RealTime) -> None:
     sys.setswitchinterval(obtained.switch_interval_s)
     gc.unfreeze()
     gc.enable()
-
-
-def _attempt(action: Callable[[], None], lines: list[str]) -> bool:
-    try:
-        action()
-    except OSError as error:
-        lines.append(str(error.strerror))
-        return False
-    return True
-
-
-def _schedule() -> None:
-    try:
-        # Threads and processes that it starts are ordinary ones.
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
-    except OSError as error:
-        raise OSError(
-            error.errno,
-            "no real-time scheduling (SCHED_FIFO is not permitted): jitter will be larger; "
-            "permit it with LimitRTPRIO=99 in the systemd unit, or `ulimit -r 99`",
-        ) from error
-
-
-def _lock_memory(libc: ctypes.CDLL) -> None:
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
-        raise OSError(
-            ctypes.get_errno(),
-            "memory is not locked (mlockall is not permitted): a page fault may delay a cycle; "
-            "permit it with LimitMEMLOCK=infinity in the systemd unit, or `ulimit -l unlimited`",
-        )
 
 
 class Alarm:

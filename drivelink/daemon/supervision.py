@@ -180,7 +180,7 @@ class Supervisor:
         for node, watched in self._nodes.items():
             over = f"node {node}: its mapping is known, its frames are used"
             self._of(node).keep(f"mapping {node}", node in doubts, doubts.get(node, ""), over)
-            unasked = follower.unasked(node)
+            unasked = follower.listener.unasked(node)
             if unasked > watched.unasked:
                 watched.unasked = unasked
                 text = f"node {node}: {unasked} SDO answers so far belong to no request heard: not used"

@@ -10,9 +10,7 @@ from drivelink.canopen.eds import DataSheet, load_eds
 from drivelink.canopen.layout import MappedObject, Role, Signal
 from drivelink.canopen.pdo import (
     CHECKS,
-    Assignment,
     Available,
-    Entry,
     Tpdo,
     assign,
     describe,
@@ -167,14 +165,13 @@ def examine_sheet(section: Section, path: Path) -> None:
         section.error("mapping", str(error).removeprefix(f"{role.subject} "), "another drive, or firmware")
         return
     for assignment in plan:
-        number, entries = planned_entries(assignment)
         kept = "" if assignment.objects is not None else "its map as it is, "
-        text = " + ".join(entry_text(entry) for entry in entries)
-        section.ok("configured", f"TPDO{number} = {text}, {kept}at every SYNC")
+        text = " + ".join(map(entry_text, assignment.entries))
+        section.ok("configured", f"TPDO{assignment.tpdo.number} = {text}, {kept}at every SYNC")
     report_checks(section, role, mappable, velocity_as_check(available), tpdos)
     section.facts["mapping"] = [
-        {"tpdo": number, "objects": [f"0x{i:04X}:{s:02X}:{b}" for i, s, b in entries]}
-        for number, entries in map(planned_entries, plan)
+        {"tpdo": one.tpdo.number, "objects": [f"0x{i:04X}:{s:02X}:{b}" for i, s, b in one.entries]}
+        for one in plan
     ]
 
 
@@ -186,13 +183,6 @@ def _title(sheet: DataSheet) -> str:
     parts += [f"vendor 0x{sheet.vendor_id:X}"] if sheet.vendor_id else []
     parts += [f"product 0x{sheet.product_code:X}"] if sheet.product_code else []
     return ", ".join([part for part in parts if part] + [f"{len(sheet.objects)} objects"])
-
-
-def planned_entries(assignment: Assignment) -> tuple[int, tuple[Entry, ...]]:
-    """Return the number and entries of a TPDO as it would be configured."""
-    if assignment.objects is None:
-        return assignment.tpdo.number, assignment.tpdo.entries
-    return assignment.tpdo.number, tuple((*c.address, c.bits) for c in assignment.objects)
 
 
 def _is_encoder(sheet: DataSheet) -> bool:

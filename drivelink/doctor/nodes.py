@@ -28,7 +28,6 @@ from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.datasheet import (
     asked_signals,
     curious,
-    planned_entries,
     report_checks,
     report_sync_counter,
     velocity_as_check,
@@ -220,9 +219,7 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
     if all(signal in now for signal, objects in wanted.items() if objects):
         section.ok(role.subject, "its mapping carries everything that is needed")
     else:
-        parts = []
-        for number, entries in map(planned_entries, plan):
-            parts.append(f"TPDO{number} = {' + '.join(map(entry_text, entries))}")
+        parts = [f"TPDO{one.tpdo.number} = {' + '.join(map(entry_text, one.entries))}" for one in plan]
         section.info(role.subject, f"will be configured to send {'; '.join(parts)}", "drivelink run does it")
     sensorless = vendor_of(survey.identity[0]).sensorless
     if any(o.address == sensorless for o in available.get(Signal.SECOND_POSITION, ())):

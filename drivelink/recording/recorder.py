@@ -116,7 +116,7 @@ class ZenohTap:
                 self._silent_s += self._silence(now_s)
                 self._heard_s = now_s
                 try:
-                    self._take(name, sample.payload.to_bytes())
+                    self._take(name, sample)
                 except ZenohError:
                     self._impossible += 1
         return more
@@ -129,12 +129,13 @@ class ZenohTap:
         for subscriber in (self._tokens, *(subscriber for _, subscriber in self._streams)):
             subscriber.undeclare()
 
-    def _take(self, name: str, payload: bytes) -> None:
+    def _take(self, name: str, sample: zenoh.Sample) -> None:
         """Store a message.
 
         Raises:
             ZenohError: it is malformed, or of another joint.
         """
+        payload = sample.payload.to_bytes()
         if name == "snapshot":
             if not 8 < len(payload) <= MAX_BLOCK_BYTES:
                 raise ZenohError(f"expected a snapshot of at most {MAX_BLOCK_BYTES >> 20} MiB")

@@ -1,26 +1,3 @@
 """The service's part of the compiled core; one extension, `estimator._core`, holds both crates."""
 
-from estimator._core import (  # noqa: F401 - drivelink/_core.pyi has their types
-    LATE,
-    LATEST,
-    MESSAGES,
-    STATUS_BITS,
-    SYNC_COB_ID,
-    Assembler,
-    BlfFrames,
-    History,
-    JointPipeline,
-    JsonNumbers,
-    LatencyHistogram,
-    McapMessage,
-    McapMessages,
-    NodeCounters,
-    SdoTransfers,
-    SyncNumbering,
-    Tick,
-    __version__,
-    encode_estimate,
-    encode_external,
-    encode_sample,
-    json_frame,
-)
+from estimator._core import *  # noqa: F403 - drivelink/_core.pyi has names and types

@@ -244,7 +244,7 @@ def test_who_speaks_for_a_joint(name):
             assert identity.alive or step[0] == "-"
         else:
             assert identity.accepts(step[0], stale=step[1]) is step[2], step
-    assert len(identity.claims) <= MAX_CLAIMS
+    assert len(identity._claims) <= MAX_CLAIMS
 
 
 @contextmanager

@@ -198,7 +198,7 @@ def _size_receive_buffer(bus: can.BusABC, section: BusSection) -> None:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted // 2)  # the kernel doubles it
     except OSError:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted // 2)
-    have = receive_buffer_frames(bus)
+    have = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // _BYTES_PER_FRAME
     if have < frames:
         logger.info(
             "%s: the receive buffer holds %d frames of %d wanted; sudo sysctl net.core.rmem_max=%d",
@@ -207,12 +207,6 @@ def _size_receive_buffer(bus: can.BusABC, section: BusSection) -> None:
             frames,
             wanted // 2,
         )
-
-
-def receive_buffer_frames(bus: can.BusABC) -> int:
-    """Return the frames that the kernel buffers for a SocketCAN bus."""
-    sock: socket.socket = bus.socket  # type: ignore[attr-defined]
-    return sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // _BYTES_PER_FRAME
 
 
 def _reason(error: BaseException) -> str:

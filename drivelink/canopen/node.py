@@ -284,15 +284,10 @@ def _sync(role: Role, bus: BusSection, findings: Findings) -> Program[None]:
         text = "has no SYNC counter (0x1019) and may reject a SYNC with one"
         findings.warn(role.subject, text, "bus.sync_counter_overflow = 0")
         return
-    yield from _sync_counter(node, wanted)
-
-
-def _sync_counter(node: int, overflow: int) -> Program[None]:
-    """Write 0x1019, which CiA 301 (7.5.2.22) allows only while the period 0x1006 is zero."""
     period = yield from read_optional(node, 0x1006, 0)
-    if period:
+    if period:  # only while it is zero 0x1019 may be written (CiA 301, 7.5.2.22)
         yield Write(node, 0x1006, 0, 0, 4)
-    yield Write(node, 0x1019, 0, overflow, 1)
+    yield Write(node, 0x1019, 0, wanted, 1)
     if period:
         yield Write(node, 0x1006, 0, period, 4)
 

@@ -4,6 +4,7 @@ A task that is too long for one cycle is a generator: each `yield` leaves the re
 """
 
 from collections.abc import Callable, Generator
+from dataclasses import dataclass
 
 Task = Callable[[], object]
 
@@ -15,13 +16,11 @@ def _raise(error: Exception) -> None:
     raise error
 
 
+@dataclass(slots=True)
 class _Periodic:
-    __slots__ = ("action", "due_ns", "period_ns")
-
-    def __init__(self, period_s: float, action: Task, due_ns: int) -> None:
-        self.period_ns = round(period_s * 1e9)
-        self.action = action
-        self.due_ns = due_ns
+    period_ns: int
+    action: Task
+    due_ns: int
 
 
 class Housekeeping:
@@ -39,7 +38,7 @@ class Housekeeping:
 
     def every(self, period_s: float, action: Task) -> None:
         """Call `action` periodically; it, or each part of it, must take less than 0.2 ms."""
-        self._tasks.append(_Periodic(period_s, action, self._next_ns))
+        self._tasks.append(_Periodic(round(period_s * 1e9), action, self._next_ns))
 
     def run(self, now_ns: int, slack_ns: int) -> None:
         """Run due tasks within `slack_ns` of monotonic time."""

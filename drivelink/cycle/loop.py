@@ -8,6 +8,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
 
@@ -31,22 +32,20 @@ class CycleSink(Protocol):
         """Publish a cycle: its estimate, then its sample, if any."""
 
 
+@dataclass(slots=True, eq=False)
 class LoopJoint:
     """One joint in the loop."""
 
-    __slots__ = ("broken", "estimates", "fault", "name", "pipeline", "response", "sink", "stale", "work")
-
-    def __init__(self, name: str, pipeline: JointPipeline, sink: CycleSink | None) -> None:
-        self.name = name  # of the joint
-        self.pipeline = pipeline  # frames to estimates
-        self.sink = sink  # receives its output, or None
-        # the exception that ended its estimates, or empty; a new estimator in the pipeline clears it
-        self.fault = ""
-        self.broken: object = None  # the estimator that failed
-        self.estimates = 0  # published from fresh samples
-        self.stale = 0  # cycles without a sample
-        self.work = LatencyHistogram()  # from the last frame in hand to the estimate published
-        self.response = LatencyHistogram()  # from SYNC to the last frame in hand
+    name: str  # of the joint
+    pipeline: JointPipeline  # frames to estimates
+    sink: CycleSink | None  # receives its output, or None
+    # the exception that ended its estimates, or empty; a new estimator in the pipeline clears it
+    fault: str = ""
+    broken: object = None  # the estimator that failed
+    estimates: int = 0  # published from fresh samples
+    stale: int = 0  # cycles without a sample
+    work: LatencyHistogram = field(default_factory=LatencyHistogram)  # from the last frame to the estimate
+    response: LatencyHistogram = field(default_factory=LatencyHistogram)  # from SYNC to the last frame
 
 
 def _log_fault(where: str, error: Exception) -> None:

@@ -207,8 +207,12 @@ def _judge(node: _Node, answer: _Answer) -> Mismatch | None:
     text: str | None
     if one.address in node.sniffer.disputed:
         text = f"{_name(one)} has two different answers: does another device answer for it?"
+    elif one.mapped is not None:
+        text = _value_text(node, one, *one.mapped, answer)
     else:
-        text = _unit_text(one, answer) if one.mapped is None else _value_text(node, one, *one.mapped, answer)
+        number = int.from_bytes(answer.data, "little")
+        was = f"{_name(one)} was {one.unit} when it was configured"
+        text = "" if number == one.unit else f"{was}, it is {number} now"
     if text is None:
         return None
     if not text:
@@ -225,16 +229,6 @@ def _judge(node: _Node, answer: _Answer) -> Mismatch | None:
         node.found = mismatch
         node.assembler.contradict(one.node, True)
     return mismatch
-
-
-def _unit_text(one: _Object, answer: _Answer) -> str:
-    """Return what an answer contradicts; empty: nothing."""
-    number = int.from_bytes(answer.data, "little")
-    return (
-        ""
-        if number == one.unit
-        else f"{_name(one)} was {one.unit} when it was configured, it is {number} now"
-    )
 
 
 def _value_text(node: _Node, one: _Object, mapped: MappedObject, pick: Pick, answer: _Answer) -> str | None:

@@ -90,11 +90,15 @@ def note_error(errors: dict[str, int], can_id: int, data: bytes) -> None:
 
 
 class BusSource(FrameSource):
-    """Any python-can interface, by `recv` and `send`; python-can filters after reception."""
+    """Any python-can interface, by `recv` and `send`; python-can filters after reception.
 
-    def __init__(self, bus: can.BusABC) -> None:
+    Args:
+        devices: simulated ones in this thread; lets them handle sent frames and due timers.
+    """
+
+    def __init__(self, bus: can.BusABC, devices: Callable[[], object] = lambda: None) -> None:
         super().__init__()
-        self._bus = bus
+        self._bus, self._devices = bus, devices
         self._waiting: list[can.Message] = []
 
     def wait(self, timeout_s: float) -> bool:
@@ -109,6 +113,7 @@ class BusSource(FrameSource):
 
     def receive(self) -> list[CanFrame]:
         """See FrameSource."""
+        self._devices()
         messages, self._waiting = self._waiting, []
         while len(messages) < MOST_FRAMES and (message := self._receive(0.0)) is not None:
             messages.append(message)
@@ -126,6 +131,7 @@ class BusSource(FrameSource):
             self.lost_sends += 1
         except OSError as error:
             raise BusLostError(str(error)) from error
+        self._devices()
 
     def _frames(self, messages: list[can.Message]) -> list[CanFrame]:
         frames = []
@@ -141,31 +147,6 @@ class BusSource(FrameSource):
             return self._bus.recv(timeout_s)
         except Exception as error:  # python-can's interfaces raise various exceptions
             raise BusLostError(str(error) or type(error).__name__) from error
-
-
-class Pumped(FrameSource):
-    """A bus with simulated devices in this thread, which answer immediately.
-
-    Args:
-        devices: lets them handle sent frames and due timers.
-    """
-
-    def __init__(self, source: FrameSource, devices: Callable[[], object]) -> None:
-        super().__init__()
-        self._source, self._devices = source, devices
-        self.errors = source.errors
-        self.wait = source.wait  # type: ignore[method-assign]
-
-    def receive(self) -> list[CanFrame]:
-        """See FrameSource."""
-        self._devices()
-        return self._source.receive()
-
-    def send(self, cob_id: int, data: bytes) -> None:
-        """See FrameSource."""
-        self._source.send(cob_id, data)
-        self.lost_sends = self._source.lost_sends
-        self._devices()
 
 
 _SO_RXQ_OVFL = 40  # socket(7): number of dropped frames; not in the socket module
@@ -276,5 +257,4 @@ _FASTER: dict[str, Callable[[Any], FrameSource]] = {
 
 def open_source(bus: can.BusABC, devices: Callable[[], object] | None = None) -> FrameSource:
     """Open the fastest source for this bus, also with devices in this thread."""
-    source = _FASTER.get(type(bus).__name__, BusSource)(bus)
-    return source if devices is None else Pumped(source, devices)
+    return BusSource(bus, devices) if devices else _FASTER.get(type(bus).__name__, BusSource)(bus)

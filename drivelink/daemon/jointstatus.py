@@ -73,6 +73,7 @@ class JointStatus:
             state: "starting" or "stopped"; default: determined from the loop.
         """
         loop, loop_joint, events = self._loop, self._loop_joint, self._events
+        status, estimator = loop_joint.pipeline.status or 0, loop_joint.pipeline.estimator
         now = time.monotonic()
         before_s, before_estimates, before_cpu_s = self._before
         cpu_s, elapsed_s = time.process_time(), max(now - before_s, 1e-9)
@@ -97,13 +98,13 @@ class JointStatus:
             "bus": self._bus(),
             "nodes": self._supervisor.node_status(loop_joint),
             "drive_faults": self._faults(),
-            "quality": self._quality(),
+            "quality": {name: bool(status & bit) for name, bit in _QUALITY},
             "not_valid": self._not_valid(),
-            "transmissions": loop_joint.pipeline.estimator.parameters(),
-            "undeclared": loop_joint.pipeline.estimator.undeclared(),
-            "friction": loop_joint.pipeline.estimator.friction(),
-            "flexibility_torque_std_nm": loop_joint.pipeline.estimator.flexibility_torque_std_nm,
-            "residual_nm": loop_joint.pipeline.estimator.residual_nm,
+            "transmissions": estimator.parameters(),
+            "undeclared": estimator.undeclared(),
+            "friction": estimator.friction(),
+            "flexibility_torque_std_nm": estimator.flexibility_torque_std_nm,
+            "residual_nm": estimator.residual_nm,
             "residual_alarm": self._alarm(),
             "external": self._external(),
             "suspected": self._supervisor.contradiction(loop_joint) or self._suspicion(),
@@ -147,10 +148,6 @@ class JointStatus:
             f"node {node}: EMCY 0x{code:04X} ({emergency_text(code)})" if code else f"node {node}: fault"
             for node, code in self._loop_joint.pipeline.assembler.faults.items()
         ]
-
-    def _quality(self) -> dict[str, bool]:
-        status = self._loop_joint.pipeline.status or 0
-        return {name: bool(status & bit) for name, bit in _QUALITY}
 
     def _not_valid(self) -> str | None:
         """Why the last estimate is not valid, in one sentence; None: it is, or there is none."""

@@ -237,13 +237,10 @@ def _report_signal(
         parts = [f"0x{i:04X}:{s:02X} {sheet.objects[i, s].name}".rstrip() for i, s in usable]
         text = " or ".join(parts) + _more(signal, sheet, usable)
         section.ok(name, text)
-    elif there:
-        parts = [f"0x{i:04X}:{s:02X}" for i, s in there]
-        severity = Severity.ERROR if signal in _needed(sheet) else Severity.INFO
-        section.add(severity, name, f"{', '.join(parts)} is there, but cannot be mapped into a TPDO")
     else:
-        severity = Severity.ERROR if signal in _needed(sheet) else Severity.INFO
-        section.add(severity, name, "no object provides it")
+        names = ", ".join(f"0x{i:04X}:{s:02X}" for i, s in there)
+        text = f"{names} is there, but cannot be mapped into a TPDO" if there else "no object provides it"
+        section.add(Severity.ERROR if signal in _needed(sheet) else Severity.INFO, name, text)
 
 
 def _more(signal: Signal, sheet: DataSheet, usable: list[tuple[int, int]]) -> str:

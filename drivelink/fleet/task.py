@@ -49,16 +49,10 @@ def dask_setup(worker: object) -> None:
     logging.getLogger("drivelink.jointfile").setLevel(logging.ERROR)
 
 
-class Piece(NamedTuple):
-    """One part of a recording, numbered from 1."""
-
-    record: Record
-    part: int
-    parts: int
-
-
-def pieces(path: Path, joint: JointFile, base_dir: Path, limit_bytes: float) -> Iterator[Piece]:
-    """Read a recording, in equal parts in time if it does not fit.
+def pieces(
+    path: Path, joint: JointFile, base_dir: Path, limit_bytes: float
+) -> Iterator[tuple[Record, int, int]]:
+    """Read a recording, in equal parts in time if it does not fit: each, its number from 1, and how many.
 
     Args:
         base_dir: folder in which the joint's EDS files are found.
@@ -69,7 +63,7 @@ def pieces(path: Path, joint: JointFile, base_dir: Path, limit_bytes: float) -> 
     """
     parts = _parts(path, limit_bytes)
     if parts == 1:
-        yield Piece(recording.read(path, joint, base_dir=base_dir), 1, 1)
+        yield recording.read(path, joint, base_dir=base_dir), 1, 1
         return
     logging.getLogger("drivelink.fleet").warning(
         "%s: larger than the memory of a worker: cut into %d parts", path.name, parts
@@ -77,7 +71,7 @@ def pieces(path: Path, joint: JointFile, base_dir: Path, limit_bytes: float) -> 
     with tempfile.TemporaryDirectory(prefix="drivelink-parts-") as folder:
         table = path if path.suffix.lower() == ".csv" else _as_csv(path, joint, base_dir, Path(folder))
         for number, piece in enumerate(_cut(table, parts, Path(folder) / path.with_suffix(".csv").name), 1):
-            yield Piece(recording.read(piece, joint, base_dir=base_dir), number, parts)
+            yield recording.read(piece, joint, base_dir=base_dir), number, parts
 
 
 def _parts(path: Path, limit_bytes: float) -> int:
@@ -230,28 +224,25 @@ def _results(
     with joint.base_dir() as base, _validation(task, joint, base) as validation:
         where = HELD_OUT if validation is None or task.previous is None else task.previous.url
         begin: float | None = None
-        for piece in pieces(path, file, base, limit):
-            at = piece.record.start_s + float(piece.record.sequence[0]) * piece.record.period_s
+        for record, number, parts in pieces(path, file, base, limit):
+            at = record.start_s + float(record.sequence[0]) * record.period_s
             begin = at if begin is None else begin
-            part = f", part {piece.part} of {piece.parts}" if piece.parts > 1 else ""
-            title = Title(
-                joint.name,
-                task.source.name + part,
-                None if validation is None else where,
-                file.axis == "linear",
-            )
-            remarks = gate(path, file, piece.record, strict=True)
-            analysis = analyse(piece.record, file, validation, title, remarks)
-            suffix = f"-{piece.part}" if piece.parts > 1 else ""
+            name, suffix = task.source.name, ""
+            if parts > 1:
+                name, suffix = f"{name}, part {number} of {parts}", f"-{number}"
+            held = None if validation is None else where
+            title = Title(joint.name, name, held, file.axis == "linear")
+            remarks = gate(path, file, record, strict=True)
+            analysis = analyse(record, file, validation, title, remarks)
             folder = f"diagnoses/{joint.name}/{row['digest'][:24]}{suffix}"
             common = row | analysis.joint | {
-                "status": "done", "error": None, "part": piece.part, "parts": piece.parts,
+                "status": "done", "error": None, "part": number, "parts": parts,
                 "axis": file.axis, "validated_on": where, "report": f"{folder}/report.html",
                 "time": row["time"] and row["time"] + timedelta(seconds=at - begin),
             }  # fmt: skip
             for one in analysis.transmissions:
-                name = f"{row['digest'][:24]}-{joint.name}-{one['transmission']}{suffix}"
-                rows.append(common | one | {"id": name})
+                own = f"{row['digest'][:24]}-{joint.name}-{one['transmission']}{suffix}"
+                rows.append(common | one | {"id": own})
             reports.append((f"{folder}/report.json", analysis.report_json))
             reports.append((f"{folder}/report.html", analysis.report_html))
     return rows, reports

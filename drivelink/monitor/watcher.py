@@ -39,11 +39,6 @@ class _Joint:
         self.heard_s = -float("inf")
         self.estimate_s = -float("inf")
 
-    @property
-    def useful(self) -> bool:
-        """Whether a daemon is alive or has sent anything."""
-        return self.identity.bound is not None and self.identity.alive
-
 
 class Watcher:
     """Follows one joint or all of them.
@@ -167,7 +162,8 @@ class Watcher:
         joint = self._joints.get(name)
         if joint is None:
             if len(self._joints) >= MAX_JOINTS:
-                idle = next((key for key, other in self._joints.items() if not other.useful), None)
+                known = self._joints.items()  # of some no daemon has sent anything that is alive
+                idle = next((k for k, one in known if not (one.identity.bound and one.identity.alive)), None)
                 if idle is None:
                     return None
                 del self._joints[idle]

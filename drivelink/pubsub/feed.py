@@ -152,11 +152,6 @@ class DaemonIdentity:
         self._seen = False
 
     @property
-    def claims(self) -> frozenset[str]:
-        """Sessions that claim to be this joint's daemon."""
-        return frozenset(self._claims)
-
-    @property
     def rivals(self) -> int:
         """Number of other sessions that claim to be this joint's daemon."""
         claims = self._claims

@@ -172,7 +172,7 @@ class _Topic:
     def __init__(self, session: zenoh.Session, node: _Node, topic: str, kind: str) -> None:
         type_hash = _HUMBLE_HASH if node.section.distro == "humble" else TYPE_HASHES[kind]
         key = f"{node.section.domain}/{topic.strip('/')}/{kind}/{type_hash}"
-        token = node.publisher_token(f"{_mangle(topic)}/{kind}/{type_hash}/{_QOS}")
+        token = f"{node.token(next(_entities), 'MP')}/{_mangle(topic)}/{kind}/{type_hash}/{_QOS}"
         self._gid = xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
         self._sequence = 0
         publisher = session.declare_publisher(
@@ -199,18 +199,11 @@ class _Node:
         self.namespace = "/" + section.namespace.strip("/") if section.namespace.strip("/") else ""
         self._zid = str(session.info.zid())
         self._name = name
-        self._id = next(_entities)
+        self.id = next(_entities)
 
-    def token(self) -> str:
-        """Return the liveliness key of the node."""
-        return self._token(self._id, "NN")
-
-    def publisher_token(self, rest: str) -> str:
-        """Return the liveliness key of its next publisher."""
-        return f"{self._token(next(_entities), 'MP')}/{rest}"
-
-    def _token(self, entity: int, kind: str) -> str:
-        numbers = f"{self.section.domain}/{self._zid}/{self._id}/{entity}"
+    def token(self, entity: int, kind: str) -> str:
+        """Return the liveliness key of the node ("NN"), or how that of a publisher ("MP") begins."""
+        numbers = f"{self.section.domain}/{self._zid}/{self.id}/{entity}"
         return f"@ros2_lv/{numbers}/{kind}/%/{_mangle(self.namespace)}/{self._name}"
 
 
@@ -237,7 +230,7 @@ class Ros2Publisher:
         self._period_s = joint.bus.period_s
         self._entities: list[Any] = []
         try:
-            self._entities.append(session.liveliness().declare_token(node.token()))
+            self._entities.append(session.liveliness().declare_token(node.token(node.id, "NN")))
             kinds = tuple(TYPE_HASHES)
             self._states = _Topic(session, node, f"{node.namespace}/joint_states", kinds[0])
             self._stiffness = _Topic(session, node, f"{node.namespace}/{name}/stiffness", kinds[1])

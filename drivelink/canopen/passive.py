@@ -76,7 +76,7 @@ class PassiveConfigurator:
     def lose_sight(self, nodes: Iterable[int] | None = None, why: str = "the bus was lost") -> None:
         """Handle a time in which nodes (None: all) may have restarted unheard."""
         for node in self._nodes if nodes is None else nodes:
-            self._nodes[node].lose_sight(why)
+            self._nodes[node].restart(why)
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> bool:
         """Process a frame: SDO, boot-up, NMT resets, PDOs.

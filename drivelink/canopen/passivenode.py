@@ -15,9 +15,6 @@ from drivelink.notice import Notice
 
 Address = tuple[int, int]
 
-_COMMUNICATION = frozenset(
-    {(0x1005, 0), (0x1006, 0), (0x1017, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3), (0x1018, 4), (0x1019, 0)}
-)
 _IDENTITY = tuple((0x1018, subindex) for subindex in (1, 2, 3, 4))
 _STORED = ((0x1020, 1), (0x1020, 2))  # date and time of the configuration
 _STORE_OR_RESTORE = (0x1010, 0x1011)
@@ -40,7 +37,7 @@ class PassiveNode:
         self.role, self._bus = role, bus
         self._sheet = load_eds(role.eds, role.node_id) if role.eds is not None else None
         self._units = {address for vendor in VENDORS.values() for address in unit_objects(role, vendor)}
-        followed = self._units.union(_COMMUNICATION, _STORED)
+        followed = self._units.union(_VOLATILE, _IDENTITY, _STORED)
         self.listener = SdoSniffer(
             lambda *address: address[1] <= _MOST_ENTRIES if is_mapping(address) else address in followed,
             bus.sdo_timeout_s,
@@ -56,15 +53,14 @@ class PassiveNode:
         self.heard: dict[int, int] = {}  # lengths of frames with its predefined identifiers
         self._told: set[Notice] = set()
 
-    def restart(self) -> None:
-        """Handle a boot-up: mapping and parameters are the node's defaults again."""
-        self.restarted, self.adopted, self.lost = True, None, ""
-        self.listener.forget(lambda address: is_mapping(address) or address in _VOLATILE)
+    def restart(self, lost: str = "") -> None:
+        """Handle a boot-up: mapping and parameters are the node's defaults again.
 
-    def lose_sight(self, why: str) -> None:
-        """Handle a time in which the node may have restarted unheard."""
-        self.restart()
-        self.lost = why
+        Args:
+            lost: why there may have been one that was not heard.
+        """
+        self.restarted, self.adopted, self.lost = True, None, lost
+        self.listener.forget(lambda address: is_mapping(address) or address in _VOLATILE)
 
     def request(self, data: bytes, now_s: float) -> None:
         """Process an SDO frame of the master."""
@@ -87,7 +83,7 @@ class PassiveNode:
             if value is not None and self._identity.setdefault(address, value) != value:
                 self._identity[address], self.stored = value, True
                 if address not in self.listener.written:
-                    self.lose_sight("it has another identity or date of configuration than before")
+                    self.restart("it has another identity or date of configuration than before")
 
     def untold(self, notices: Iterable[Notice]) -> list[Notice]:
         """Return the findings that were not told before, while there are not too many."""

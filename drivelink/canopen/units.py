@@ -35,15 +35,22 @@ def unit_objects(role: Role, vendor: Vendor) -> tuple[Address, ...]:
     if role.drive is not None:
         wanted += _DRIVE_OBJECTS + vendor.objects()
         if role.drive.second_encoder is not None:
-            subindex = object_address(role.drive.second_encoder, f"{role.key}.second_encoder")[1]
-            wanted += ((0x60E6, subindex), (0x60EB, subindex))
-    if role.encoder is not None:
-        if role.encoder.source == "cia406":
-            wanted += _ENCODER_OBJECTS
-        else:
-            subindex = _encoder_address(role.encoder, role.key)[1]
-            wanted += ((0x60E6, subindex), (0x60EB, subindex))
+            wanted += _resolution(object_address(role.drive.second_encoder, f"{role.key}.second_encoder"))
+    if role.encoder is not None and role.encoder.source == "cia406":
+        wanted += _ENCODER_OBJECTS
+    elif role.encoder is not None:
+        wanted += _resolution(_encoder_address(role.encoder, role.key))
     return wanted
+
+
+def _resolution(encoder: Address) -> tuple[Address, Address]:
+    """Return the objects whose ratio is the counts per revolution of a further encoder (CiA 402-2)."""
+    return (0x60E6, encoder[1]), (0x60EB, encoder[1])
+
+
+def _ratio(reported: Mapping[Address, int], numerator: Address, denominator: Address) -> float | None:
+    above, below = reported.get(numerator, 0), reported.get(denominator, 1)
+    return above / below if above > 0 and below > 0 else None
 
 
 def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
@@ -93,14 +100,10 @@ class _Drive:
         stated = getattr(self._drive, key) if key in self._drive.model_fields_set else None
         return _chosen(self._role, self._result, what, f"{self._role.key}: {key}", stated, reported, source)
 
-    def _ratio(self, numerator: Address, denominator: Address) -> float | None:
-        above, below = self._reported.get(numerator, 0), self._reported.get(denominator, 1)
-        return above / below if above > 0 and below > 0 else None
-
     def _drive_gear(self) -> tuple[float | None, str]:
-        ratio, source = self._ratio((0x6091, 1), (0x6091, 2)), "0x6091"
+        ratio, source = _ratio(self._reported, (0x6091, 1), (0x6091, 2)), "0x6091"
         if ratio is None and self._vendor.gear:
-            ratio, source = self._ratio(*self._vendor.gear), f"0x{self._vendor.gear[0][0]:04X}"
+            ratio, source = _ratio(self._reported, *self._vendor.gear), f"0x{self._vendor.gear[0][0]:04X}"
         return ratio, source
 
     def _gear(self) -> float:
@@ -127,7 +130,7 @@ class _Drive:
         if angle is not None:  # user units at the output of the drive's gear
             gear = self._drive_gear()[0] or 1.0
             return math.tau / angle / gear, "0x60A8"
-        reported = self._ratio((0x608F, 1), (0x608F, 2))
+        reported = _ratio(self._reported, (0x608F, 1), (0x608F, 2))
         if reported is not None and reported > 1:  # 1/1 is the value of an unconfigured drive
             return reported, "0x608F"
         if self._vendor.counts_per_rev:
@@ -146,7 +149,7 @@ class _Drive:
         if counts is None or Signal.MOTOR_POSITION in self._result.missing:
             return
         scale = self._drive.direction * math.tau / (counts * gear)
-        feed = self._ratio((0x6092, 1), (0x6092, 2))
+        feed = _ratio(self._reported, (0x6092, 1), (0x6092, 2))
         if feed is not None and feed > 1 and not math.isclose(feed, counts * gear, rel_tol=_SAME):
             self._result.info(
                 self._role.subject,
@@ -278,7 +281,7 @@ class _Drive:
         if text is None:
             return
         address = object_address(text, f"{self._role.key}.second_encoder")
-        reported = self._ratio((0x60E6, address[1]), (0x60EB, address[1]))
+        reported = _ratio(self._reported, *_resolution(address))
         per_rev = reported if reported is not None and reported > 1 else counts
         if per_rev is not None:
             scale = self._drive.direction * math.tau / (per_rev * gear)

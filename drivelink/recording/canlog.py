@@ -9,7 +9,7 @@ from binascii import unhexlify
 from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime
 from functools import partial
-from itertools import chain, islice, pairwise
+from itertools import accumulate, chain, islice, pairwise
 from pathlib import Path
 from statistics import median
 from typing import IO, Any, NamedTuple
@@ -261,14 +261,7 @@ def _dated(first: list[LoggedFrame], frames: Iterable[LoggedFrame], path: Path) 
     if len(stamps) < 8 or falls < 0.2 * len(stamps) or median(stamps[half:]) > max(stamps[: half // 2]):
         return iter(frames)
     _LOG.warning("%s: the stamps are differences from frame to frame: added up", path)
-    return _added_up(frames)
-
-
-def _added_up(frames: Iterable[LoggedFrame]) -> Iterator[LoggedFrame]:
-    total = 0
-    for frame in frames:
-        total += frame[0]
-        yield logged((total, *frame[1:]))
+    return accumulate(frames, lambda before, one: logged((before[0] + one[0], *one[1:])))
 
 
 def _asc_frames(file: IO[bytes], path: Path) -> Iterator[Frame | None]:

@@ -170,14 +170,16 @@ class EstimatesFile:
         columns = _columns(motors) + (external_columns() if linked else ())
         self._linked, self._estimator = linked, estimator
         self._line = ",".join(["%r"] * len(columns)) + "\n"
-        self._rows = [",".join(columns) + "\n"]
-        self._file = SafeFile(path, force=force)
+        self._file, self._count = SafeFile(path, force=force), 0
+        self._file.write((",".join(columns) + "\n").encode())
 
     def write(self, played: Played) -> None:
         """Write one row."""
         row = _row(played, self._estimator)
-        self._rows.append(self._line % (row + external_row(played.tick.external) if self._linked else row))
-        if len(self._rows) >= _ROWS:
+        row += external_row(played.tick.external) if self._linked else ()
+        self._file.write((self._line % row).encode())
+        self._count += 1
+        if self._count % _ROWS == 0:
             self._write()
 
     def close(self) -> None:
@@ -187,8 +189,6 @@ class EstimatesFile:
             self._file.close()
 
     def _write(self) -> None:
-        self._file.write("".join(self._rows).encode("ascii"))
-        self._rows.clear()
         try:
             self._file.flush()
         except RecordingError:

@@ -41,6 +41,11 @@ def _known(effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
 _Effects = Annotated[tuple[Effect, ...], AfterValidator(_known)]
 
 
+def key(default: Any, about: str, **limits: Any) -> Any:
+    """Return the field of a key that may be left out; `limits` as of pydantic's `Field`."""
+    return Field(default, description=about, **limits)
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
@@ -62,12 +67,8 @@ class TpdoSection(_Section):
         max_length=64,
         description='mapped objects in order, "index:subindex:bits", e.g. "0x6064:00:32"',
     )
-    transmission_type: int = Field(
-        1, ge=0, le=255, description="1 to 240: every so many SYNCs; 254, 255: event-driven"
-    )
-    default: bool = Field(
-        False, description="the node has this mapping after every start; false: a master writes it"
-    )
+    transmission_type: int = key(1, "1 to 240: every so many SYNCs; 254, 255: event-driven", ge=0, le=255)
+    default: bool = key(False, "the node has this mapping after every start; false: a master writes it")
 
     @model_validator(mode="after")
     def _objects(self) -> Self:
@@ -81,64 +82,48 @@ class DriveSection(_Section):
     """The drive of one motor. Values that the drive reports may be left out."""
 
     node_id: int = Field(ge=1, le=127, description="CANopen node id")
-    counts_per_rev: float | None = Field(None, gt=0, description="counts per motor revolution (0x608F)")
-    gear_ratio: float = Field(1.0, gt=0, description="motor revolutions per joint revolution (0x6091)")
-    torque_constant_nm_a: float | None = Field(
-        None, gt=0, description="torque at the motor shaft per ampere; turns a current into a torque"
+    counts_per_rev: float | None = key(None, "counts per motor revolution (0x608F)", gt=0)
+    gear_ratio: float = key(1.0, "motor revolutions per joint revolution (0x6091)", gt=0)
+    torque_constant_nm_a: float | None = key(
+        None, "torque at the motor shaft per ampere; turns a current into a torque", gt=0
     )
-    rated_current_a: float | None = Field(
-        None, gt=0, description="unit of 0x6078 is a thousandth of it (0x6075)"
+    rated_current_a: float | None = key(None, "unit of 0x6078 is a thousandth of it (0x6075)", gt=0)
+    rated_torque_nm: float | None = key(None, "unit of 0x6077 is a thousandth of it (0x6076)", gt=0)
+    torque_source: Literal["auto", "torque", "current"] = key(
+        "auto", "source of the motor torque: 0x6077, or 0x6078 and the constant"
     )
-    rated_torque_nm: float | None = Field(
-        None, gt=0, description="unit of 0x6077 is a thousandth of it (0x6076)"
+    current_object: str | None = key(None, 'vendor object for the current, e.g. "0x30D1:02"')
+    current_unit_a: float = key(0.001, "amperes per count of current_object", gt=0)
+    velocity: bool = key(False, "also map 0x606C (the robust mode differentiates positions itself)")
+    velocity_rad_s_per_count: float | None = key(
+        None, "unit of 0x606C at the motor shaft, where 0x60A9 does not give it", gt=0
     )
-    torque_source: Literal["auto", "torque", "current"] = Field(
-        "auto", description="source of the motor torque: 0x6077, or 0x6078 and the constant"
+    checks: tuple[Literal["velocity", "current", "following_error"], ...] = key(
+        (), "also map these, for cross-checks"
     )
-    current_object: str | None = Field(None, description='vendor object for the current, e.g. "0x30D1:02"')
-    current_unit_a: float = Field(0.001, gt=0, description="amperes per count of current_object")
-    velocity: bool = Field(
-        False, description="also map 0x606C (the robust mode differentiates positions itself)"
+    second_encoder: str | None = key(
+        None, 'position of a second encoder of the motor, for a cross-check, e.g. "0x60E4:02"'
     )
-    velocity_rad_s_per_count: float | None = Field(
-        None, gt=0, description="unit of 0x606C at the motor shaft, where 0x60A9 does not give it"
+    direction: Direction = key(1, "sign of the motor position against the joint's")
+    torque_direction: Direction | None = key(None, "sign of the torque; left out: like direction")
+    eds: str | None = key(None, "EDS or DCF file, relative to the joint file")
+    tpdo: tuple[TpdoSection, ...] = key(
+        (), "the mapping, where it is not read from the drive", max_length=512
     )
-    checks: tuple[Literal["velocity", "current", "following_error"], ...] = Field(
-        (), description="also map these, for cross-checks"
-    )
-    second_encoder: str | None = Field(
-        None, description='position of a second encoder of the motor, for a cross-check, e.g. "0x60E4:02"'
-    )
-    direction: Direction = Field(1, description="sign of the motor position against the joint's")
-    torque_direction: Direction | None = Field(
-        None, description="sign of the torque; left out: like direction"
-    )
-    eds: str | None = Field(None, description="EDS or DCF file, relative to the joint file")
-    tpdo: tuple[TpdoSection, ...] = Field(
-        (), max_length=512, description="the mapping, where it is not read from the drive"
-    )
-    heartbeat_ms: int = Field(100, ge=0, le=65535, description="heartbeat requested from the drive; 0: none")
+    heartbeat_ms: int = key(100, "heartbeat requested from the drive; 0: none", ge=0, le=65535)
 
 
 class EncoderSection(_Section):
     """The link encoder."""
 
-    source: Literal["drive", "cia406"] = Field(
-        "drive", description="wired to a drive (0x60E4), or a node of its own"
-    )
-    node_id: int | None = Field(
-        None, ge=1, le=127, description="its node; left out with a drive: the first motor's"
-    )
-    object: str | None = Field(None, description='position object; default "0x60E4:01" or "0x6004:00"')
-    counts_per_rev: float | None = Field(
-        None, gt=0, description="counts per joint revolution (0x6501 of CiA 406)"
-    )
-    direction: Direction = Field(1, description="sign against the joint's")
-    offset_rad: float = Field(0.0, description="subtracted from the link position")
-    eds: str | None = Field(None, description="EDS or DCF file, relative to the joint file")
-    tpdo: tuple[TpdoSection, ...] = Field(
-        (), max_length=512, description="the mapping, where it is not read from the node"
-    )
+    source: Literal["drive", "cia406"] = key("drive", "wired to a drive (0x60E4), or a node of its own")
+    node_id: int | None = key(None, "its node; left out with a drive: the first motor's", ge=1, le=127)
+    object: str | None = key(None, 'position object; default "0x60E4:01" or "0x6004:00"')
+    counts_per_rev: float | None = key(None, "counts per joint revolution (0x6501 of CiA 406)", gt=0)
+    direction: Direction = key(1, "sign against the joint's")
+    offset_rad: float = key(0.0, "subtracted from the link position")
+    eds: str | None = key(None, "EDS or DCF file, relative to the joint file")
+    tpdo: tuple[TpdoSection, ...] = key((), "the mapping, where it is not read from the node", max_length=512)
 
     @model_validator(mode="after")
     def _node(self) -> Self:
@@ -151,18 +136,18 @@ class MotorSection(_Section):
     """One motor and its transmission, reflected to the joint side."""
 
     inertia_kg_m2: float = Field(gt=0, description="B of eqs 5, 7, joint side")
-    inertia_std_relative: float | None = Field(
-        None, gt=0, le=1, description="relative standard deviation of the inertia; default 0.05"
+    inertia_std_relative: float | None = key(
+        None, "relative standard deviation of the inertia; default 0.05", gt=0, le=1
     )
-    viscous_damping_nm_s_rad: float = Field(0.0, ge=0, description="D_theta of eqs 5, 7, joint side")
-    viscous_damping_std_nm_s_rad: float | None = Field(
-        None, ge=0, description="standard deviation of the damping, as `fit` writes it"
+    viscous_damping_nm_s_rad: float = key(0.0, "D_theta of eqs 5, 7, joint side", ge=0)
+    viscous_damping_std_nm_s_rad: float | None = key(
+        None, "standard deviation of the damping, as `fit` writes it", ge=0
     )
     transmission: Transmission = Field(
         default_factory=Transmission, description="model of the flexibility torque"
     )
-    effect: _Effects = Field((), max_length=MOST_EFFECTS, description="effects the model has been given")
-    drive: DriveSection | None = Field(None, description="needed by run, sim, record and doctor")
+    effect: _Effects = key((), "effects the model has been given", max_length=MOST_EFFECTS)
+    drive: DriveSection | None = key(None, "needed by run, sim, record and doctor")
 
     @model_validator(mode="after")
     def _parameters_can_be(self) -> MotorSection:
@@ -186,38 +171,30 @@ class MotorSection(_Section):
 class LinkSection(_Section):
     """The link side."""
 
-    encoder: EncoderSection | None = Field(None, description="the link encoder")
-    dynamics: LinkDynamics | None = Field(
-        None, description="needed for the external torque and residual (eq 12)"
-    )
-    effect: _Effects = Field((), max_length=MOST_EFFECTS, description="effects at the link or in its encoder")
+    encoder: EncoderSection | None = key(None, "the link encoder")
+    dynamics: LinkDynamics | None = key(None, "needed for the external torque and residual (eq 12)")
+    effect: _Effects = key((), "effects at the link or in its encoder", max_length=MOST_EFFECTS)
 
 
 class BusSection(_Section):
     """The CAN bus and the cycle on it."""
 
-    interface: str = Field(
-        "virtual", description="python-can interface: socketcan, slcan, socketcand, virtual, …"
-    )
-    channel: str = Field("drivelink", description="python-can channel, e.g. can0")
-    bitrate: int = Field(1_000_000, gt=0, description="bit/s; the bus load is computed with it")
+    interface: str = key("virtual", "python-can interface: socketcan, slcan, socketcand, virtual, …")
+    channel: str = key("drivelink", "python-can channel, e.g. can0")
+    bitrate: int = key(1_000_000, "bit/s; the bus load is computed with it", gt=0)
     options: dict[str, Any] = Field(default_factory=dict, description="passed to can.Bus as they are")
-    period_s: float = Field(
+    period_s: float = key(
         0.001,
+        "communication cycle: one SYNC, one sample; when following and left out: measured",
         ge=1e-4,
         le=1.0,
-        description="communication cycle: one SYNC, one sample; when following and left out: measured",
     )
-    sync: Literal["produce", "follow"] = Field(
-        "produce", description="produce SYNC, or follow another master's"
-    )
-    sync_counter_overflow: int = Field(0, ge=0, le=240, description="0x1019: 0, or 2 to 240")
-    configure: bool = Field(True, description="configure the nodes; false: passive, never sends a frame")
-    sdo_timeout_s: float = Field(0.5, gt=0, description="for each SDO transfer")
-    sdo_retries: int = Field(1, ge=0, description="further attempts after an SDO timeout")
-    read_back_s: float = Field(
-        2.0, ge=0, description="between two SDO uploads that check units and mapped values; 0: none"
-    )
+    sync: Literal["produce", "follow"] = key("produce", "produce SYNC, or follow another master's")
+    sync_counter_overflow: int = key(0, "0x1019: 0, or 2 to 240", ge=0, le=240)
+    configure: bool = key(True, "configure the nodes; false: passive, never sends a frame")
+    sdo_timeout_s: float = key(0.5, "for each SDO transfer", gt=0)
+    sdo_retries: int = key(1, "further attempts after an SDO timeout", ge=0)
+    read_back_s: float = key(2.0, "between two SDO uploads that check units and mapped values; 0: none", ge=0)
 
     def moved(self, interface: str | None = None, channel: str | None = None) -> BusSection:
         """Return the section with another interface or channel, if given.
@@ -236,8 +213,8 @@ class ColumnSection(_Section):
     """Where one of our columns comes from in a plant's own CSV files."""
 
     name: str = Field(min_length=1, description="of the column in the file")
-    unit: str | float = Field("", description="of its numbers, or a factor; left out: that of our name")
-    sign: Direction = Field(1, description="against the joint's")
+    unit: str | float = key("", "of its numbers, or a factor; left out: that of our name")
+    sign: Direction = key(1, "against the joint's")
 
 
 class RecordingSection(_Section):
@@ -251,14 +228,12 @@ class RecordingSection(_Section):
         default_factory=dict,
         description='columns of other names: link_position_rad = { name = "q", unit = "deg", sign = -1 }',
     )
-    folder: str | None = Field(
-        None,
-        min_length=1,
-        description="where the black box keeps what led to an event; left out: no black box",
+    folder: str | None = key(
+        None, "where the black box keeps what led to an event; left out: no black box", min_length=1
     )
-    keep_s: float = Field(60.0, ge=1.0, le=600.0, description="time before an event that is kept")
-    keep_mib: float = Field(1024.0, gt=0.0, description="disk for it; the oldest is dropped")
-    keep_contacts: bool = Field(False, description="keep what led to a contact, too")
+    keep_s: float = key(60.0, "time before an event that is kept", ge=1.0, le=600.0)
+    keep_mib: float = key(1024.0, "disk for it; the oldest is dropped", gt=0.0)
+    keep_contacts: bool = key(False, "keep what led to a contact, too")
 
     @model_validator(mode="after")
     def _columns(self) -> Self:
@@ -280,35 +255,33 @@ class RecordingSection(_Section):
 class ZenohSection(_Section):
     """Where the estimates go."""
 
-    config: str | None = Field(None, description="zenoh configuration (JSON5), relative to the joint file")
-    subscriber_config: str | None = Field(
-        None, description="that of monitor, record, accept, doctor and the black box; left out: `config`"
+    config: str | None = key(None, "zenoh configuration (JSON5), relative to the joint file")
+    subscriber_config: str | None = key(
+        None, "that of monitor, record, accept, doctor and the black box; left out: `config`"
     )
-    prefix: str = Field(
-        "drivelink", pattern=r"^[^*$#?\s/]+(/[^*$#?\s/]+)*$", description="first part of every key"
-    )
-    endpoint: str = Field("tcp/127.0.0.1:7447", description="where subscribers connect, unless config says")
+    prefix: str = key("drivelink", "first part of every key", pattern=r"^[^*$#?\s/]+(/[^*$#?\s/]+)*$")
+    endpoint: str = key("tcp/127.0.0.1:7447", "where subscribers connect, unless config says")
 
 
 class Ros2Section(_Section):
     """Publishing for ROS 2 nodes with rmw_zenoh."""
 
-    enabled: bool = Field(True, description="publish JointState, stiffness and diagnostics")
-    domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID")
-    namespace: str = Field("", description="namespace of the node and its topics")
-    distro: Literal["humble", "jazzy", "kilted"] = Field("jazzy", description="decides the type hashes")
-    every: int = Field(1, ge=1, description="publish every n-th cycle")
+    enabled: bool = key(True, "publish JointState, stiffness and diagnostics")
+    domain: int = key(0, "ROS_DOMAIN_ID", ge=0, le=232)
+    namespace: str = key("", "namespace of the node and its topics")
+    distro: Literal["humble", "jazzy", "kilted"] = key("jazzy", "decides the type hashes")
+    every: int = key(1, "publish every n-th cycle", ge=1)
 
 
 class MotionSection(_Section):
     """What a motion that `diagnose --motion` designs may reach; left out: what the recordings reach."""
 
-    position_rad: tuple[float, float] | None = Field(
-        None, description="of each motor: lowest and highest position, at the joint"
+    position_rad: tuple[float, float] | None = key(
+        None, "of each motor: lowest and highest position, at the joint"
     )
-    velocity_rad_s: float | None = Field(None, gt=0, description="largest amount")
-    acceleration_rad_s2: float | None = Field(None, gt=0, description="largest amount")
-    torque_nm: float | None = Field(None, gt=0, description="largest amount of the motor's torque")
+    velocity_rad_s: float | None = key(None, "largest amount", gt=0)
+    acceleration_rad_s2: float | None = key(None, "largest amount", gt=0)
+    torque_nm: float | None = key(None, "largest amount of the motor's torque", gt=0)
 
     @model_validator(mode="after")
     def _positions(self) -> Self:
@@ -322,16 +295,14 @@ class MotionSection(_Section):
 class SimSection(_Section):
     """The simulated world that `sim` and `demo` put on the bus; `run` never reads it."""
 
-    case: Literal["constant", "quadratic", "vsa-ii"] | None = Field(
-        None, description="one of the paper's cases"
-    )
+    case: Literal["constant", "quadratic", "vsa-ii"] | None = key(None, "one of the paper's cases")
     parameters: dict[str, float] = Field(
         default_factory=dict, description="true values that differ from the model's"
     )
-    effect: tuple[Effect, ...] = Field((), description="effects of the world that the model may not know")
+    effect: tuple[Effect, ...] = key((), "effects of the world that the model may not know")
     excitation: dict[str, Any] = Field(default_factory=dict, description="torque of the rig, see reference")
-    quirks: str | None = Field(None, description="vendor profile of the drives")
-    seed: int = Field(0, ge=0, description="seed of the sensor noise")
+    quirks: str | None = key(None, "vendor profile of the drives")
+    seed: int = key(0, "seed of the sensor noise", ge=0)
 
     @model_validator(mode="after")
     def _parameters(self) -> Self:
@@ -343,21 +314,21 @@ class JointFile(_Section):
     """A joint, its drives, its bus and its keys."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", description="part of the key expression")
-    arrangement: Arrangement = Field("single", description="how the transmissions act on the link")
-    axis: Literal["rotary", "linear"] = Field(
-        "rotary", description="linear: every rad in a name is a metre, every N·m a newton"
+    arrangement: Arrangement = key("single", "how the transmissions act on the link")
+    axis: Literal["rotary", "linear"] = key(
+        "rotary", "linear: every rad in a name is a metre, every N·m a newton"
     )
     motor: tuple[MotorSection, ...] = Field(min_length=1, max_length=2, description="one, or two for a VSA")
-    link: LinkSection = Field(LinkSection(), description="the link side")
-    bus: BusSection = Field(BusSection(), description="the CAN bus")
-    recording: RecordingSection = Field(RecordingSection(), description="recordings and the black box")
+    link: LinkSection = key(LinkSection(), "the link side")
+    bus: BusSection = key(BusSection(), "the CAN bus")
+    recording: RecordingSection = key(RecordingSection(), "recordings and the black box")
     estimator: EstimatorSettings = Field(
         default_factory=EstimatorSettings, description="mode, bandwidths, gains"
     )
-    zenoh: ZenohSection = Field(ZenohSection(), description="the zenoh side")
-    ros2: Ros2Section | None = Field(None, description="publish for ROS 2")
-    motion: MotionSection = Field(MotionSection(), description="limits of a designed motion")
-    sim: SimSection | None = Field(None, description="the simulated world")
+    zenoh: ZenohSection = key(ZenohSection(), "the zenoh side")
+    ros2: Ros2Section | None = key(None, "publish for ROS 2")
+    motion: MotionSection = key(MotionSection(), "limits of a designed motion")
+    sim: SimSection | None = key(None, "the simulated world")
     provenance: dict[str, Any] = Field(
         default_factory=dict,
         description="written by fit and diagnose: when and from what the model was fitted",

@@ -190,15 +190,12 @@ class BlackBox(Sink):
             return
         status = json.loads(payload)
         self._day.status(status)
-        holding = {
-            cause
-            for cause, holds in (
-                ("suspected signal", (status.get("suspected") or {}).get("reason", "late") != "late"),
-                ("drive fault", status.get("drive_faults")),
-                ("bus lost", status.get("state") == "bus lost"),
-            )
-            if holds
+        states = {
+            "suspected signal": (status.get("suspected") or {}).get("reason", "late") != "late",
+            "drive fault": status.get("drive_faults"),
+            "bus lost": status.get("state") == "bus lost",
         }
+        holding = {cause for cause, holds in states.items() if holds}
         for cause in sorted(holding - self._holding):
             self.keep(cause)
         self._holding = holding

@@ -170,10 +170,15 @@ class Client:
     def _pop(self) -> zenoh.Sample | None:
         raise NotImplementedError
 
+    @property
+    def _fed(self) -> Feed:
+        """The feed, with all messages that are queued in zenoh."""
+        self._drain()
+        return self._feed
+
     def latest(self) -> EstimateMessage | None:
         """Return the newest estimate, without waiting; None until the first one came."""
-        self._drain()
-        return self._feed.latest
+        return self._fed.latest
 
     def take(self) -> NDArray[np.void]:
         """Return every estimate not yet read, oldest first, as one numpy record array; never waits.
@@ -181,8 +186,7 @@ class Client:
         Fields are those of the wire (`drivelink.pubsub.wire.ESTIMATE`): `a["stiffness_nm_rad"]` is (n,),
         `a["transmissions"]["deflection_rad"]` is (n, transmissions).
         """
-        self._drain()
-        unread = self._feed.unread
+        unread = self._fed.unread
         count = len(unread[-1][1].transmissions) if unread else 1
         dtype = ESTIMATE.dtype(count)
         joined = b"".join(payload for payload, _ in unread if len(payload) == dtype.itemsize)
@@ -192,22 +196,19 @@ class Client:
     @property
     def state(self) -> State:
         """waiting, live, stale or gone."""
-        self._drain()
-        return self._feed.state(time.monotonic_ns())
+        return self._fed.state(time.monotonic_ns())
 
     @property
     def age_s(self) -> float:
         """Time since the latest estimate arrived, by the local clock, s; infinite before the first."""
-        self._drain()
-        if self._feed.latest is None:
+        if self._fed.latest is None:
             return math.inf
         return self._feed.arrivals.age_ns(time.monotonic_ns()) / 1e9
 
     @property
     def stale(self) -> bool:
         """Whether the latest estimate is too old to act on, or missing."""
-        self._drain()
-        return self._feed.stale(time.monotonic_ns())
+        return self._fed.stale(time.monotonic_ns())
 
     @property
     def usable(self) -> bool:
@@ -249,32 +250,27 @@ class Client:
     @property
     def gaps(self) -> int:
         """Missing cycles, by sequence numbers."""
-        self._drain()
-        return self._feed.gaps
+        return self._fed.gaps
 
     @property
     def skipped(self) -> int:
         """Cycles dropped because more than `depth` were unread."""
-        self._drain()
-        return self._feed.skipped
+        return self._fed.skipped
 
     @property
     def received(self) -> int:
         """Number of received estimates."""
-        self._drain()
-        return self._feed.received
+        return self._fed.received
 
     @property
     def foreign(self) -> int:
         """Unused messages on the joint's keys: of other sessions, or invalid."""
-        self._drain()
-        return self._feed.identity.refused + self._feed.unusable
+        return self._fed.identity.refused + self._feed.unusable
 
     @property
     def daemon(self) -> str | None:
         """The zenoh session whose messages are used, or None."""
-        self._drain()
-        return self._feed.identity.bound
+        return self._fed.identity.bound
 
     @property
     def rivals(self) -> int:
@@ -308,14 +304,12 @@ class Client:
                 close_session(self._session)
 
     def _fresh(self, bit: Status) -> bool:
-        self._drain()
-        latest = self._feed.latest
+        latest = self._fed.latest
         return latest is not None and bool(latest.status & bit) and not self.stale
 
     def _message(self, name: str) -> Any:
         """Return the newest message of a key that the daemon wrote, or None."""
-        self._drain()
-        identity = self._feed.identity
+        identity = self._fed.identity
         with suppress(zenoh.ZError):
             while (sample := self._newest_of[name].try_recv()) is not None:
                 if self._feed.trusts(source_of(sample), time.monotonic_ns()):

@@ -55,38 +55,34 @@ def decode_document(payload: bytes) -> dict[str, Any]:
         raise ZenohError("document: expected JSON in UTF-8") from error
     if not isinstance(document, dict):
         raise ZenohError("document: expected a JSON object")
-    cleaned: dict[str, Any] = _Cleaner().clean(document, 0)
+    cleaned: dict[str, Any] = _cleaned(document, iter(range(MAX_ELEMENTS)))
     return cleaned
 
 
-class _Cleaner:
-    """Makes a parsed document safe, counting its elements."""
+def _cleaned(value: Any, left: Iterator[int], depth: int = 0) -> Any:
+    """Return a parsed value made safe.
 
-    def __init__(self) -> None:
-        self._left = MAX_ELEMENTS
+    Args:
+        left: yields once for each element that there may still be.
 
-    def clean(self, value: Any, depth: int) -> Any:
-        """Return the value made safe.
-
-        Raises:
-            ZenohError: it has too many elements or levels.
-        """
-        self._left -= 1
-        if self._left < 0:
-            raise ZenohError(f"document: expected at most {MAX_ELEMENTS} elements")
-        if isinstance(value, str):
-            return clean_text(value)
-        if isinstance(value, bool) or value is None:
-            return value
-        if isinstance(value, int):
-            return value if abs(value) <= _LARGEST_INTEGER else None
-        if isinstance(value, float):
-            return value if math.isfinite(value) else None
-        if depth == MAX_DEPTH:
-            raise ZenohError(_TOO_DEEP)
-        if isinstance(value, list):
-            return [self.clean(item, depth + 1) for item in value]
-        return {clean_text(key, MAX_KEY): self.clean(item, depth + 1) for key, item in value.items()}
+    Raises:
+        ZenohError: it has too many elements or levels.
+    """
+    if next(left, None) is None:
+        raise ZenohError(f"document: expected at most {MAX_ELEMENTS} elements")
+    if isinstance(value, str):
+        return clean_text(value)
+    if isinstance(value, bool) or value is None:
+        return value
+    if isinstance(value, int):
+        return value if abs(value) <= _LARGEST_INTEGER else None
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if depth == MAX_DEPTH:
+        raise ZenohError(_TOO_DEEP)
+    if isinstance(value, list):
+        return [_cleaned(item, left, depth + 1) for item in value]
+    return {clean_text(key, MAX_KEY): _cleaned(item, left, depth + 1) for key, item in value.items()}
 
 
 # The payloads of a joint's keys, by the last part of the key.

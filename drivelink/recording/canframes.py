@@ -209,12 +209,8 @@ class FrameLog:
             require_in_range("period_s", measured.period_s, positive=True)
         except EstimatorError as error:
             raise RecordingError(f"{self._path}: of its SYNCs, {error}") from error
-        _LOG.warning(
-            "%s: SYNC comes every %.4g s, not every %.4g s as bus.period_s says: taken as it comes",
-            self._path,
-            measured.period_s,
-            configured_s,
-        )
+        text = "%s: SYNC comes every %.4g s, not every %.4g s as bus.period_s says: taken as it comes"
+        _LOG.warning(text, self._path, measured.period_s, configured_s)
         return measured.period_s
 
 

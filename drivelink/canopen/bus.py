@@ -122,14 +122,12 @@ def _check_socketcan(section: BusSection) -> None:
 
 def _check_socketcand(section: BusSection) -> None:
     """Check that a socketcand answers: python-can would try for ten seconds, or wait forever."""
-    host, port = (
-        section.options.get("host", _SOCKETCAND_HOST),
-        section.options.get("port", _SOCKETCAND_PORT),
-    )
+    options = section.options
+    host, port = options.get("host", _SOCKETCAND_HOST), options.get("port", _SOCKETCAND_PORT)
     if not isinstance(host, str) or not isinstance(port, int):
         raise BusError(
             'socketcand: expected bus.options = { host = "127.0.0.1", port = 29536 }, '
-            f"got {section.options or 'none'}"
+            f"got {options or 'none'}"
         )
     try:
         with socket.create_connection((host, port), timeout=_CONNECT_S) as connection:
@@ -200,13 +198,8 @@ def _size_receive_buffer(bus: can.BusABC, section: BusSection) -> None:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted // 2)
     have = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // _BYTES_PER_FRAME
     if have < frames:
-        logger.info(
-            "%s: the receive buffer holds %d frames of %d wanted; sudo sysctl net.core.rmem_max=%d",
-            section.channel,
-            have,
-            frames,
-            wanted // 2,
-        )
+        text = "%s: the receive buffer holds %d frames of %d wanted; sudo sysctl net.core.rmem_max=%d"
+        logger.info(text, section.channel, have, frames, wanted // 2)
 
 
 def _reason(error: BaseException) -> str:

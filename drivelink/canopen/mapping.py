@@ -62,7 +62,7 @@ class Mapper:
     role: Role  # what the node is there for
     # for each signal, the objects that the node has for it, best first
     available: Mapping[Signal, Sequence[MappedObject]]
-    tpdos: list[Tpdo]  # as they are in the node
+    tpdos: dict[int, Tpdo]  # as they are in the node, by number
     taken: set[int]  # identifiers in use elsewhere on the bus
     prefer_unused: bool  # see `pdo.assign`
     findings: Findings  # added to
@@ -83,7 +83,8 @@ class Mapper:
         available = {signal: list(candidates) for signal, candidates in self.available.items()}
         while True:
             try:
-                assignments = assign(self.role, available, self.tpdos, prefer_unused=self.prefer_unused)
+                tpdos = tuple(self.tpdos.values())
+                assignments = assign(self.role, available, tpdos, prefer_unused=self.prefer_unused)
             except DriveError as error:
                 raise DriveError(f"{error}{self._refusal}") from error
             try:
@@ -108,24 +109,20 @@ class Mapper:
         severity = Severity.INFO if available[signal] else Severity.WARNING
         self.findings.add(severity, self.role.subject, text)
 
-    def _replace(self, tpdo: Tpdo) -> None:
-        self.tpdos[[other.number for other in self.tpdos].index(tpdo.number)] = tpdo
-
     def _apply(self, assignment: Assignment) -> Program[None]:
         """Configure one TPDO, if necessary."""
         tpdo, entries = assignment.tpdo, assignment.entries
         mine = {chosen for number, chosen in self._chosen.items() if number != tpdo.number}
-        mine |= {other.cob_id for other in self.tpdos if other.enabled and other.number != tpdo.number}
+        mine |= {one.cob_id for number, one in self.tpdos.items() if one.enabled and number != tpdo.number}
         cob_id = choose_cob_id(self.role.node_id, tpdo, self.taken | mine)
         self._chosen[tpdo.number] = cob_id
         if tpdo.enabled and tpdo.cob_id == cob_id and tpdo.transmission_type == 1 and tpdo.entries == entries:
             return
         try:
-            changed = yield from self._write(tpdo, cob_id, entries, assignment.objects)
+            self.tpdos[tpdo.number] = yield from self._write(tpdo, cob_id, entries, assignment.objects)
         except (_MapFixed, _ObjectRefused):
             del self._chosen[tpdo.number]
             raise
-        self._replace(changed)
 
     def _write(
         self, tpdo: Tpdo, cob_id: int, entries: tuple[Entry, ...], objects: tuple[MappedObject, ...] | None
@@ -190,7 +187,7 @@ class Mapper:
         Raises:
             _MapFixed: always: the signals are to be assigned anew.
         """
-        self._replace(replace(tpdo, **known))
+        self.tpdos[tpdo.number] = replace(tpdo, **known)
         answer = f"0x{abort.index:04X}:{abort.subindex:02X} answers {abort_text(abort.code)}"
         self.findings.info(self.role.subject, f"TPDO{tpdo.number} {what} ({answer})")
         self._refusal = self._refusal or f"; writing {answer}"
@@ -265,7 +262,7 @@ class Mapper:
         """Restore mapping and identifier after a refusal."""
         node = self.role.node_id
         try:
-            if tpdo.known and not self._is_fixed(tpdo):
+            if tpdo.known and not self.tpdos[tpdo.number].fixed:
                 yield Write(node, tpdo.mapping, 0, 0, 1)
                 for position, (index, subindex, bits) in enumerate(tpdo.entries, start=1):
                     yield Write(node, tpdo.mapping, position, index << 16 | subindex << 8 | bits, 4)
@@ -274,16 +271,13 @@ class Mapper:
         except SdoAbort as abort:
             self.findings.warn(self.role.subject, f"TPDO{tpdo.number} could not be put back: {abort}")
 
-    def _is_fixed(self, tpdo: Tpdo) -> bool:
-        return any(other.fixed for other in self.tpdos if other.number == tpdo.number)
-
     def _read_back(self, numbers: Iterable[int]) -> Program[tuple[TpdoLayout, ...]]:
         used: list[Tpdo] = []
         for number in numbers:
             tpdo = yield from read_tpdo(self.role.node_id, number, exactly=True)
             if tpdo is None or not tpdo.enabled:
                 raise DriveError(f"{self.role.subject}: TPDO{number} stays disabled after its configuration")
-            self._replace(replace(tpdo, fixed=self._is_fixed(tpdo)))
+            self.tpdos[number] = replace(tpdo, fixed=self.tpdos[number].fixed)
             used.append(tpdo)
         rest = {signal: objects for signal, objects in self.readable.items() if signal not in self.available}
         layouts = decode(used, {**self.available, **rest})

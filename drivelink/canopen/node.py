@@ -191,7 +191,7 @@ def _configured(
     mapper = Mapper(
         role=role,
         available=available,
-        tpdos=list(survey.tpdos),
+        tpdos={tpdo.number: tpdo for tpdo in survey.tpdos},
         taken=taken,
         prefer_unused=bus.sync == "follow",
         findings=findings,
@@ -200,7 +200,7 @@ def _configured(
     )
     layouts = yield from mapper.program()
     used = {layout.number for layout in layouts}
-    others = tuple(tpdo for tpdo in mapper.tpdos if tpdo.enabled and tpdo.number not in used)
+    others = tuple(tpdo for tpdo in mapper.tpdos.values() if tpdo.enabled and tpdo.number not in used)
     others = yield from _others(role, others, {layout.cob_id for layout in layouts}, drop_others, findings)
     yield from _sync(role, bus, findings)
     heartbeat_ms = yield from _heartbeat(role, findings)

@@ -82,15 +82,11 @@ def _timed(section: BusSection, stamps_ns: Sequence[int]) -> BusSection:
     measured = measure_period(stamps_ns, section.period_s)
     if measured is None or measured.same:
         return section
-    level, text = logging.INFO, f"SYNC comes every {measured.period_s * 1e3:.4g} ms"
+    comes = f"{measured.period_s * 1e3:.4g} ms"
+    level, text = logging.INFO, f"SYNC comes every {comes}"
     if "period_s" in section.model_fields_set:
-        level, text = (
-            logging.WARNING,
-            (
-                f"{text}, the joint file says {section.period_s * 1e3:g} ms: {measured.period_s * 1e3:.4g} ms is "
-                f"used; set bus.period_s = {measured.period_s:.4g}, or leave it out"
-            ),
-        )
+        level, says = logging.WARNING, f"the joint file says {section.period_s * 1e3:g} ms: {comes} is used"
+        text += f", {says}; set bus.period_s = {measured.period_s:.4g}, or leave it out"
     logger.log(level, "%s: %s", section.channel, text)
     return section.model_copy(update={"period_s": measured.period_s})
 

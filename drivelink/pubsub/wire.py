@@ -80,18 +80,14 @@ def _codes(fields: tuple[Field, ...]) -> str:
     return "".join(_STRUCT_CODES[field.type] for field in fields)
 
 
-def _part(name: str) -> tuple[Field, ...]:
-    return tuple(Field(*field) for field in MESSAGES[name])
+def _layout(name: str, elements: str = "") -> Layout:
+    head, element = ([Field(*field) for field in MESSAGES.get(part, ())] for part in (name, elements))
+    return Layout(schema=f"drivelink.{name}/1", head=tuple(head), elements=elements, element=tuple(element))
 
 
-ESTIMATE = Layout(
-    schema="drivelink.estimate/1",
-    head=_part("estimate"),
-    elements="transmissions",
-    element=_part("transmissions"),
-)
-EXTERNAL = Layout(schema="drivelink.external/1", head=_part("external"))
-SAMPLE = Layout(schema="drivelink.sample/1", head=_part("sample"), elements="motors", element=_part("motors"))
+ESTIMATE = _layout("estimate", "transmissions")
+EXTERNAL = _layout("external")
+SAMPLE = _layout("sample", "motors")
 
 
 class EstimateMessage(NamedTuple):

@@ -141,13 +141,9 @@ def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]
         if last - stamp_ns > _DISORDER_NS and frame[0] != NO_STAMP:
             jumps += 1
             if jumps == 1:
-                _LOG.warning(
-                    "%s: the stamps jump back by %.4g s at %.6f s: taken as a gap of %g s",
-                    path,
-                    (last - stamp_ns) * 1e-9,
-                    frame.stamp_ns * 1e-9,
-                    _GAP_NS * 1e-9,
-                )
+                text = "%s: the stamps jump back by %.4g s at %.6f s: taken as a gap of %g s"
+                back_s, at_s = (last - stamp_ns) * 1e-9, frame.stamp_ns * 1e-9
+                _LOG.warning(text, path, back_s, at_s, _GAP_NS * 1e-9)
             offset += last + _GAP_NS - stamp_ns
             stamp_ns = last + _GAP_NS
         require_stamp(stamp_ns, path)

@@ -254,24 +254,16 @@ def _on_grid(
         number = np.interp(np.flatnonzero(rows), np.flatnonzero(grid.keep), grid.sequence)
     if position is not None and stamps_are_instants(time, number, position[rows]):
         steps = np.diff(time)
-        _LOG.warning(
-            "%s: steps from %.3g s to %.3g s, and the motion follows the stamps: resampled every %.3g s",
-            where,
-            steps.min(),
-            steps.max(),
-            np.median(steps),
-        )
+        text = "%s: steps from %.3g s to %.3g s, and the motion follows the stamps: resampled every %.3g s"
+        _LOG.warning(text, where, steps.min(), steps.max(), np.median(steps))
         again = resampled(measured, rows)
         return again, find_grid(again["time_s"], where, nominal_s)
     if grid is None:
         known = columns["time_s"][np.isfinite(columns["time_s"])]
         period_s = nominal_s or float(known[-1] - known[0]) / (len(known) - 1)
         raise RecordingError(f"{refused}{_renumber(where, period_s)}")
-    _LOG.warning(
-        "%s: the stamps jitter by up to %.2g periods: taken as arrival times of a uniform sampling",
-        where,
-        grid.jittering,
-    )
+    text = "%s: the stamps jitter by up to %.2g periods: taken as arrival times of a uniform sampling"
+    _LOG.warning(text, where, grid.jittering)
     return columns, grid
 
 

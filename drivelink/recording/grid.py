@@ -90,15 +90,12 @@ def report_gaps(sequence: NDArray[np.int64], period_s: float, where: str) -> Non
     steps = np.diff(sequence)
     gaps = steps > 1
     if np.any(gaps):
-        _LOG.warning(
-            "%s: %s, %d of %d samples missing, the longest %.6g s at %.6g s",
-            where,
-            counted(int(np.count_nonzero(gaps)), "gap"),
-            int(np.sum(steps[gaps] - 1)),
-            int(sequence[-1] - sequence[0] + 1),
-            (int(steps.max()) - 1) * period_s,
-            int(sequence[int(steps.argmax())] - sequence[0]) * period_s,
-        )
+        missing, whole = int(np.sum(steps[gaps] - 1)), int(sequence[-1] - sequence[0] + 1)
+        longest_s = (int(steps.max()) - 1) * period_s
+        at_s = int(sequence[int(steps.argmax())] - sequence[0]) * period_s
+        text = "%s: %s, %d of %d samples missing, the longest %.6g s at %.6g s"
+        number = counted(int(np.count_nonzero(gaps)), "gap")
+        _LOG.warning(text, where, number, missing, whole, longest_s, at_s)
 
 
 def _require_forward(steps: FloatArray, rows: NDArray[np.int64], time: FloatArray, where: str) -> None:

@@ -4,7 +4,7 @@ An MCAP file carries both; other formats get a file beside them: `r.log` has `r.
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -77,11 +77,8 @@ def recorded_layouts(path: Path, joint: str, *, daemon: bool, begun: bool = Fals
         RecordingError: the mapping is damaged.
     """
     with raised_as(RecordingError, f"{path}: its mapping cannot be read", ValueError):
-        if path.suffix.lower() != ".mcap":
-            side = _read_side(path)
-            return layouts_from(side, joint, daemon=daemon) if side else ()
-        for message in read_messages(path, frozenset({"mapping"} if begun else {"mapping", "model"})):
-            if layouts := layouts_from(message.data, joint, daemon=daemon):
+        for data in _carried(path, {"mapping"} if begun else {"mapping", "model"}):
+            if layouts := layouts_from(data, joint, daemon=daemon):
                 return layouts
     return ()
 
@@ -98,12 +95,7 @@ def joint_of(path: Path, named: Path | None) -> JointText:
         return jointfile.load_text(named)
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
-    carried: bytes | None = None
-    if path.suffix.lower() == ".mcap":
-        message = next(read_messages(path, frozenset({"joint"})), None)
-        carried = message.data if message is not None else None
-    elif path.suffix.lower() in CAN_SUFFIXES:
-        carried = _read_side(path)
+    carried = next(_carried(path, {"joint"}), None)
     if carried is None:
         raise UsageError(f"{path}: expected joint=FILE, the joint file that it was recorded with")
     try:
@@ -128,11 +120,14 @@ def contained(joint: JointFile) -> JointFile:
     return joint.model_copy(update={"motor": tuple(motors), "link": link, "zenoh": zenoh})
 
 
-def _read_side(path: Path) -> bytes | None:
-    side = side_file(path)
-    with raised_as(RecordingError, f"{side}: cannot be read"), suppress(FileNotFoundError):
-        return read_regular(side, MAX_BYTES)
-    return None
+def _carried(path: Path, topics: set[str]) -> Iterator[bytes]:
+    """Yield the documents of these topics in an MCAP file, or what is beside a log."""
+    if path.suffix.lower() == ".mcap":
+        yield from (message.data for message in read_messages(path, frozenset(topics)))
+    elif path.suffix.lower() in CAN_SUFFIXES:
+        side = side_file(path)
+        with raised_as(RecordingError, f"{side}: cannot be read"), suppress(FileNotFoundError):
+            yield read_regular(side, MAX_BYTES)
 
 
 _POSITIONS = (

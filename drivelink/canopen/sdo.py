@@ -122,82 +122,65 @@ def read_number(node: int, index: int, subindex: int) -> Program[int]:
     return int.from_bytes((yield Read(node, index, subindex, _NUMBER_BYTES)), "little")
 
 
-class _Transfer:
-    """One upload or download."""
+_Transfer = Generator[bytes, bytes, bytes]
+"""Yields the frames to send, empty where there is none yet; gets those of the server; returns the object."""
 
-    def __init__(self, request: Read | Write) -> None:
-        self.request = request  # what it is for
-        self.result: bytes | None = None  # its result; None until it has ended
-        self._buffer = bytearray()
-        self._toggle = 0
-        self._segmented = False
-        self._declared: int | None = None
-        self._most = 0
-        self.answered = False  # the server has begun to answer
 
-    def first(self) -> bytes:
-        self._buffer.clear()
-        self._toggle, self._segmented, self._declared = 0, False, None
-        self.answered = False
-        request = self.request
-        object_ = request.index.to_bytes(2, "little") + bytes([request.subindex])
-        if isinstance(request, Read):
-            return b"\x40" + object_ + bytes(4)
-        command = 0x23 | (4 - request.size) << 2
-        return bytes([command]) + object_ + request.value.to_bytes(request.size, "little").ljust(4, b"\0")
+def _answer(request: Read | Write, frame: bytes, command: int, *, named: bool = True) -> _Transfer:
+    """Send a frame, and return the answer with that command; others are late, or for another master.
 
-    def answer(self, data: bytes) -> bytes | None:
-        """Process a frame of the server; return the frame to send next, if any.
+    Args:
+        named: whether the answer names the object.
 
-        Raises:
-            SdoAbort: the server aborted.
-            SdoBreach: a protocol error, or another number of bytes than declared.
-        """
-        request = self.request
-        if len(data) != 8:
-            return None
-        command = data[0] >> 5
-        ours = data[1] | data[2] << 8 == request.index and data[3] == request.subindex
-        if command == 4 and (ours or not any(data[1:4])):  # some servers abort without naming the object
-            raise SdoAbort(request, int.from_bytes(data[4:8], "little"))
-        if self._segmented:
-            return self._segment(data) if command == 0 else None
-        if not ours:
-            return None  # a late answer to an abandoned transfer, or one to another master
-        if isinstance(request, Write):
-            self.result = b"" if command == 3 else None
-            return None
-        if command != 2:
-            return None
-        if data[0] & 0x02:
-            unused = (data[0] >> 2) & 3
-            self.result = bytes(data[4 : 8 - unused]) if data[0] & 0x01 else Unsized(data[4:8])
-            return None
-        if data[0] & 0x01:
-            self._declared = int.from_bytes(data[4:8], "little")
-        if self._declared is not None and self._declared > request.most:
-            raise SdoBreach(request, _TOO_LONG, f"{self._declared} bytes, expected {request.most} at most")
-        self._most = request.most if self._declared is None else self._declared
-        self._segmented = self.answered = True
-        return b"\x60" + bytes(7)
+    Raises:
+        SdoAbort: the server aborted.
+    """
+    data = yield frame
+    while True:
+        if len(data) == 8:
+            ours = data[1] | data[2] << 8 == request.index and data[3] == request.subindex
+            if data[0] >> 5 == 4 and (ours or not any(data[1:4])):  # some abort without naming the object
+                raise SdoAbort(request, int.from_bytes(data[4:8], "little"))
+            if data[0] >> 5 == command and (ours or not named):
+                return data
+        data = yield b""
 
-    def _segment(self, data: bytes) -> bytes | None:
-        if (data[0] >> 4) & 1 != self._toggle:
-            raise SdoBreach(self.request, _TOGGLE_ERROR, "a segment out of turn")
+
+def _transfer(request: Read | Write) -> _Transfer:
+    """One upload or download.
+
+    Raises:
+        SdoAbort: the server aborted.
+        SdoBreach: a protocol error, or another number of bytes than declared.
+    """
+    object_ = request.index.to_bytes(2, "little") + bytes([request.subindex])
+    if isinstance(request, Write):
+        value = request.value.to_bytes(request.size, "little").ljust(4, b"\0")
+        yield from _answer(request, bytes([0x23 | (4 - request.size) << 2]) + object_ + value, 3)
+        return b""
+    head = yield from _answer(request, b"\x40" + object_ + bytes(4), 2)
+    if head[0] & 0x02:
+        unused = (head[0] >> 2) & 3
+        return head[4 : 8 - unused] if head[0] & 0x01 else Unsized(head[4:8])
+    declared = int.from_bytes(head[4:8], "little") if head[0] & 0x01 else None
+    most = request.most if declared is None else declared
+    if most > request.most:
+        raise SdoBreach(request, _TOO_LONG, f"{declared} bytes, expected {request.most} at most")
+    content, toggle, last = b"", 0, False
+    while not last:
+        data = yield from _answer(request, bytes([0x60 | toggle << 4]) + bytes(7), 0, named=False)
+        if (data[0] >> 4) & 1 != toggle:
+            raise SdoBreach(request, _TOGGLE_ERROR, "a segment out of turn")
         part, last = data[1 : 8 - ((data[0] >> 1) & 7)], bool(data[0] & 0x01)
-        self._buffer += part
-        if len(self._buffer) > self._most:
-            raise SdoBreach(self.request, _TOO_LONG, f"more than {self._most} bytes")
-        if last and self._declared is not None and len(self._buffer) < self._declared:
-            what = f"{len(self._buffer)} bytes after declaring {self._declared}"
-            raise SdoBreach(self.request, _TOO_SHORT, what)
-        if last:
-            self.result = bytes(self._buffer)
-            return None
-        if not part:
-            raise SdoBreach(self.request, _WRONG_LENGTH, "a segment without data that is not the last")
-        self._toggle ^= 1
-        return bytes([0x60 | self._toggle << 4]) + bytes(7)
+        content += part
+        toggle ^= 1
+        if len(content) > most:
+            raise SdoBreach(request, _TOO_LONG, f"more than {most} bytes")
+        if not (part or last):
+            raise SdoBreach(request, _WRONG_LENGTH, "a segment without data that is not the last")
+    if declared is not None and len(content) < declared:
+        raise SdoBreach(request, _TOO_SHORT, f"{len(content)} bytes after declaring {declared}")
+    return content
 
 
 class Session(Generic[T]):
@@ -214,7 +197,8 @@ class Session(Generic[T]):
         self._send = send
         self._timeout_s = timeout_s
         self._retries = retries
-        self._transfer: _Transfer | None = None
+        self._asked: tuple[Read | Write, _Transfer] | None = None  # what is waited for
+        self._begun = False  # whether the server has begun to answer
         self._deadline_s = self._end_s = -float("inf")
         self._attempts = 0
         self._started = False
@@ -225,7 +209,7 @@ class Session(Generic[T]):
     @property
     def asks(self) -> int | None:
         """The node whose answer it waits for, or None."""
-        return self._transfer.request.node if self._transfer is not None else None
+        return self._asked[0].node if self._asked is not None else None
 
     @property
     def result(self) -> T:
@@ -242,23 +226,22 @@ class Session(Generic[T]):
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
         """Process a frame of the bus; frames of other transfers are ignored."""
-        transfer = self._transfer
-        if transfer is None or cob_id != 0x580 + transfer.request.node:
+        if self._asked is None or cob_id != 0x580 + self._asked[0].node:
             return
+        request, transfer = self._asked
         try:
-            following = transfer.answer(bytes(data))
+            following = transfer.send(bytes(data))
+        except StopIteration as stop:
+            self._advance(now_s, stop.value)
         except SdoAbort as abort:
             if isinstance(abort, SdoBreach):
-                self._abort_transfer(transfer, abort.code)
-            self._transfer = None
+                self._abort(request, abort.code)
             self._advance(now_s, abort)
-            return
-        if following is not None:
-            self._put(0x600 + transfer.request.node, following)
-            self._deadline_s = min(now_s + self._timeout_s, self._end_s)
-        elif transfer.result is not None:
-            self._transfer = None
-            self._advance(now_s, transfer.result)
+        else:
+            if following:
+                self._begun = True
+                self._put(0x600 + request.node, following)
+                self._deadline_s = min(now_s + self._timeout_s, self._end_s)
 
     def poll(self, now_s: float) -> bool:
         """Start or advance the program; return whether it has ended."""
@@ -267,22 +250,21 @@ class Session(Generic[T]):
             self._advance(now_s, None)
         if self.done or now_s < self._deadline_s:
             return self.done
-        transfer = self._transfer
-        if transfer is None:
+        if self._asked is None:
             self._advance(now_s, b"")
-        elif self._attempts <= self._retries:
-            self._abort_transfer(transfer, _TIMED_OUT)
-            self._begin(transfer, now_s)
+            return self.done
+        request, _ = self._asked
+        self._abort(request, _TIMED_OUT)
+        if self._attempts <= self._retries:
+            self._begin(request, now_s)
         else:
-            self._transfer = None
-            self._abort_transfer(transfer, _TIMED_OUT)
-            begun = transfer.answered
-            waited_s = self._timeout_s * (_TRANSFER_TIMEOUTS if begun else 1)
-            self._advance(now_s, SdoTimeout(transfer.request, waited_s, self._attempts, begun=begun))
+            waited_s = self._timeout_s * (_TRANSFER_TIMEOUTS if self._begun else 1)
+            self._advance(now_s, SdoTimeout(request, waited_s, self._attempts, begun=self._begun))
         return self.done
 
     def _advance(self, now_s: float, answer: bytes | Exception | None) -> None:
         """Pass an answer to the program and execute its requests up to the next wait."""
+        self._asked = None
         try:
             while True:
                 if isinstance(answer, Exception):
@@ -297,22 +279,22 @@ class Session(Generic[T]):
                     self._deadline_s = now_s + request.seconds
                     return
                 self._attempts = 0
-                self._begin(_Transfer(request), now_s)
+                self._begin(request, now_s)
                 return
         except StopIteration as stop:
             self.done, self._result = True, stop.value
         except DriveError as error:
             self.done, self._error = True, error
 
-    def _begin(self, transfer: _Transfer, now_s: float) -> None:
-        self._transfer = transfer
+    def _begin(self, request: Read | Write, now_s: float) -> None:
+        transfer = _transfer(request)
+        self._asked, self._begun = (request, transfer), False
         self._attempts += 1
         self._deadline_s = now_s + self._timeout_s
         self._end_s = now_s + _TRANSFER_TIMEOUTS * self._timeout_s
-        self._put(0x600 + transfer.request.node, transfer.first())
+        self._put(0x600 + request.node, next(transfer))
 
-    def _abort_transfer(self, transfer: _Transfer, code: int) -> None:
-        request = transfer.request
+    def _abort(self, request: Read | Write, code: int) -> None:
         frame = b"\x80" + request.index.to_bytes(2, "little") + bytes([request.subindex])
         self._put(0x600 + request.node, frame + code.to_bytes(4, "little"))
 

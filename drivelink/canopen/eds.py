@@ -6,6 +6,7 @@ none of that, and takes 50 µs for each.
 """
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -93,13 +94,11 @@ def load_eds(path: Path, node_id: int | None = None) -> DataSheet:
 
 
 def _text(raw: bytes, sheet: DataSheet) -> str:
-    for encoding in ("utf-8-sig", "cp1252"):
-        try:
-            text = raw.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-        if encoding == "cp1252":
-            sheet.problems.append("is not UTF-8 text: read as Windows text (cp1252)")
+    with suppress(UnicodeDecodeError):
+        return raw.decode("utf-8-sig")
+    with suppress(UnicodeDecodeError):
+        text = raw.decode("cp1252")
+        sheet.problems.append("is not UTF-8 text: read as Windows text (cp1252)")
         return text
     sheet.problems.append("is neither UTF-8 nor Windows text: read as Latin 1")
     return raw.decode("latin-1")
@@ -199,10 +198,8 @@ def _read_objects(sections: Sections, node: int, sheet: DataSheet) -> None:
         entry.pdo_mappable = bool(_number(keys.get("pdomapping", "")))
         sheet.objects[index, subindex] = entry
     for places, what in ((unreadable, "a value that is not a number"), (unknown, "an unknown data type")):
-        if len(places) > 1:
-            sheet.problems.append(f"object {places[0]} and {len(places) - 1} more have {what}")
-        elif places:
-            sheet.problems.append(f"object {places[0]} has {what}")
+        has = "has" if len(places) == 1 else f"and {len(places) - 1} more have"
+        sheet.problems += [f"object {places[0]} {has} {what}"] if places else []
 
 
 def _data_type(keys: dict[str, str], sections: Sections) -> int:
@@ -224,10 +221,9 @@ def _compact(index: int, keys: dict[str, str], values: dict[str, str]) -> dict[A
 
 
 def _device(sections: Sections, sheet: DataSheet) -> None:
-    info = sections.get("deviceinfo")
-    if info is None:
+    info = sections.get("deviceinfo", {})
+    if "deviceinfo" not in sections:
         sheet.problems.append("has no [DeviceInfo]")
-        info = {}
     sheet.vendor_name = clean_text(info.get("vendorname", ""))
     sheet.product_name = clean_text(info.get("productname", ""))
     empty = [key for key in ("vendornumber", "productnumber", "revisionnumber") if info.get(key) == ""]

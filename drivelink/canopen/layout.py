@@ -6,6 +6,7 @@ included: 55 for a SYNC, 135 for eight bytes.
 """
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -67,10 +68,8 @@ def roles(joint: JointFile, base_dir: Path = Path()) -> tuple[Role, ...]:
 
     for number, motor in enumerate(joint.motor):
         if motor.drive is None:
-            raise JointFileError(
-                f"{joint.name}: motor[{number + 1}].drive: expected this table, it is missing: "
-                "no bus without it"
-            )
+            expected = "expected this table, it is missing: no bus without it"
+            raise JointFileError(f"{joint.name}: motor[{number + 1}].drive: {expected}")
         add(motor.drive.node_id, number, motor.drive, f"motor[{number + 1}].drive")
     if encoder_node is not None and all(role.encoder is None for role in found):
         add(encoder_node, None, None, "link.encoder")
@@ -102,13 +101,11 @@ def object_address(text: str, key: str) -> tuple[int, int]:
         JointFileError: the text has another form.
     """
     index, _, subindex = text.partition(":")
-    try:
+    with suppress(ValueError):
         address = int(index, 16), int(subindex or "0", 16)
-    except ValueError:
-        address = (0, 0)
-    if not (0x1000 <= address[0] <= 0xFFFF and 0 <= address[1] <= 0xFF):
-        raise JointFileError(f'{key}: expected an object like "0x60E4:01", got "{text}"')
-    return address
+        if 0x1000 <= address[0] <= 0xFFFF and 0 <= address[1] <= 0xFF:
+            return address
+    raise JointFileError(f'{key}: expected an object like "0x60E4:01", got "{text}"')
 
 
 class Signal(StrEnum):

@@ -134,11 +134,8 @@ def left_open(joint: JointFile, text: str) -> bool:
 
 
 def _motor(answers: Answers, index: int, node: int) -> str:
-    gear = (
-        "# gear_ratio = 1.0  # motor revolutions per joint revolution; left out: the drive's (0x6091), else 1"
-        if answers.gear_ratio is None
-        else f"gear_ratio = {answers.gear_ratio:g}  # motor revolutions per joint revolution"
-    )
+    gear, meaning = answers.gear_ratio, "motor revolutions per joint revolution"
+    default = f"# gear_ratio = 1.0  # {meaning}; left out: the drive's (0x6091), else 1"
     inertia, origin = answers.joint_inertia_kg_m2, "rotor inertia times gear ratio squared"
     if inertia is None:
         inertia, origin = _PLACEHOLDER, f"PLACEHOLDER, put in yours: {origin}"
@@ -152,7 +149,7 @@ def _motor(answers: Answers, index: int, node: int) -> str:
         model=answers.model,
         node=node,
         remark=_remark(answers, node),
-        gear=gear,
+        gear=default if gear is None else f"gear_ratio = {gear:g}  # {meaning}",
         constant="# torque_constant_nm_a = 0.05  # where the torque has to come from the current"
         if constant is None
         else f"torque_constant_nm_a = {constant * 1e-3:.6g}  # at the shaft: {constant:g} mN·m/A",

@@ -140,8 +140,7 @@ def _existing(node: int, candidates: tuple[MappedObject, ...]) -> Program[tuple[
                 found.append(candidate)
             continue
         sized = len(data) in (1, 2, 3, 4, 8) and not isinstance(data, Unsized)
-        bits = 8 * len(data) if sized else candidate.bits
-        found.append(replace(candidate, bits=bits))
+        found.append(replace(candidate, bits=8 * len(data)) if sized else candidate)
     return tuple(found)
 
 

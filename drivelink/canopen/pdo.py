@@ -73,10 +73,8 @@ def describe(tpdos: Iterable[Tpdo]) -> str:
     """Return the mappings in one line."""
     parts = []
     for tpdo in tpdos:
-        objects = " + ".join(f"0x{index:04X}:{subindex:02X}" for index, subindex, _ in tpdo.entries) or (
-            "empty" if tpdo.known else "unknown"
-        )
-        parts.append(f"TPDO{tpdo.number} = {objects}")
+        objects = " + ".join(f"0x{index:04X}:{subindex:02X}" for index, subindex, _ in tpdo.entries)
+        parts.append(f"TPDO{tpdo.number} = {objects or ('empty' if tpdo.known else 'unknown')}")
     return "; ".join(parts) or "no TPDO"
 
 
@@ -142,15 +140,12 @@ def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
     One with an incomplete mapping is not `known`.
     """
     found = []
-    for communication in sorted({index for index, _ in values if 0x1800 <= index <= 0x19FF}):
-        cob = values.get((communication, 1))
-        if cob is None:
-            continue
+    for communication in sorted(i for i, subindex in values if 0x1800 <= i <= 0x19FF and subindex == 1):
         entries = _entries(values, communication + 0x200)
         found.append(
             Tpdo(
                 number=communication - 0x17FF,
-                cob=cob,
+                cob=values[communication, 1],
                 transmission_type=values.get((communication, 2), 255),
                 inhibit_100us=values.get((communication, 3), 0),
                 event_ms=values.get((communication, 5), 0),
@@ -219,13 +214,8 @@ def _layout(tpdo: Tpdo, chosen: dict[Address, MappedObject]) -> TpdoLayout:
     """Return one frame; what it carries is taken out of `chosen`."""
     objects = []
     for index, subindex, bits in tpdo.entries:
-        candidate = chosen.pop((index, subindex), None)
-        if candidate is not None:
-            objects.append(replace(candidate, bits=bits))
-            continue
-        objects.append(
-            MappedObject(signal=Signal.OTHER, index=index, subindex=subindex, bits=bits, signed=False)
-        )
+        other = MappedObject(signal=Signal.OTHER, index=index, subindex=subindex, bits=bits, signed=False)
+        objects.append(replace(chosen.pop((index, subindex), other), bits=bits))
     return TpdoLayout(
         cob_id=tpdo.cob_id,
         objects=tuple(objects),
@@ -354,9 +344,7 @@ def _free(
 
 def _carried(tpdo: Tpdo, wanted: Mapping[Signal, Sequence[MappedObject]]) -> list[Signal]:
     mapped = {(index, subindex) for index, subindex, _ in tpdo.entries}
-    return [
-        signal for signal, objects in wanted.items() if any(object_.address in mapped for object_ in objects)
-    ]
+    return [signal for signal, objects in wanted.items() if any(one.address in mapped for one in objects)]
 
 
 def _cannot(role: Role, wanted: Available, tpdos: Sequence[Tpdo]) -> str:

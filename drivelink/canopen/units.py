@@ -128,16 +128,13 @@ class _Drive:
     def _reported_counts(self) -> tuple[float | None, str]:
         angle = angle_unit_rad(self._reported.get((0x60A8, 0), 0))
         if angle is not None:  # user units at the output of the drive's gear
-            gear = self._drive_gear()[0] or 1.0
-            return math.tau / angle / gear, "0x60A8"
+            return math.tau / angle / (self._drive_gear()[0] or 1.0), "0x60A8"
         reported = _ratio(self._reported, (0x608F, 1), (0x608F, 2))
         if reported is not None and reported > 1:  # 1/1 is the value of an unconfigured drive
             return reported, "0x608F"
-        if self._vendor.counts_per_rev:
-            counts = self._reported.get(self._vendor.counts_per_rev, 0)
-            if counts > 1:
-                index, subindex = self._vendor.counts_per_rev
-                return float(counts * self._vendor.counts_factor), f"0x{index:04X}:{subindex:02X}"
+        address = self._vendor.counts_per_rev
+        if address and (counts := self._reported.get(address, 0)) > 1:
+            return float(counts * self._vendor.counts_factor), f"0x{address[0]:04X}:{address[1]:02X}"
         return None, ""
 
     def _position(self, counts: float | None, gear: float) -> None:
@@ -173,13 +170,9 @@ class _Drive:
         return min((1e-3, 1e-6), key=lambda unit: abs(math.log(raw * unit / evidence)))
 
     def _torque_constant(self, rated_torque: float | None, rated_current: float | None) -> float | None:
-        reported, source = None, ""
-        if self._vendor.torque_constant and self._reported.get(self._vendor.torque_constant):
-            index, subindex = self._vendor.torque_constant
-            reported, source = (
-                self._reported[self._vendor.torque_constant] * 1e-6,
-                f"0x{index:04X}:{subindex:02X}",
-            )
+        reported, source, address = None, "", self._vendor.torque_constant
+        if address and self._reported.get(address):
+            reported, source = self._reported[address] * 1e-6, f"0x{address[0]:04X}:{address[1]:02X}"
         chosen = self._choose("torque constant in N·m/A", "torque_constant_nm_a", reported, source)
         if chosen is None and rated_torque and rated_current:
             return rated_torque / rated_current

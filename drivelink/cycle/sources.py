@@ -117,7 +117,13 @@ class BusSource(FrameSource):
         messages, self._waiting = self._waiting, []
         while len(messages) < MOST_FRAMES and (message := self._receive(0.0)) is not None:
             messages.append(message)
-        return self._frames(messages)
+        frames = []
+        for message in messages:
+            if message.is_error_frame:
+                note_error(self.errors, message.arbitration_id, bytes(message.data))
+            elif not (message.is_extended_id or message.is_remote_frame):
+                frames.append(CanFrame(message.arbitration_id, bytes(message.data), received_ns(message)))
+        return frames
 
     def send(self, cob_id: int, data: bytes) -> None:
         """See FrameSource."""
@@ -132,15 +138,6 @@ class BusSource(FrameSource):
         except OSError as error:
             raise BusLostError(str(error)) from error
         self._devices()
-
-    def _frames(self, messages: list[can.Message]) -> list[CanFrame]:
-        frames = []
-        for message in messages:
-            if message.is_error_frame:
-                note_error(self.errors, message.arbitration_id, bytes(message.data))
-            elif not (message.is_extended_id or message.is_remote_frame):
-                frames.append(CanFrame(message.arbitration_id, bytes(message.data), received_ns(message)))
-        return frames
 
     def _receive(self, timeout_s: float) -> can.Message | None:
         try:

@@ -83,10 +83,8 @@ class BusWatch:
             self._foreign.popleft()
         _, foreign, skipped = self._foreign[0]
         if loop.produce and loop.foreign_syncs > foreign:
-            what = (
-                "another master produces SYNC: its cycles are not used; "
-                'set bus.sync = "follow", or stop the other one'
-            )
+            what = "another master produces SYNC: its cycles are not used; "
+            what += 'set bus.sync = "follow", or stop the other one'
         elif (loop.foreign_syncs - foreign) - (loop.skipped_periods - skipped) >= _MANY_SYNCS:
             what = "a second master produces SYNC too: its cycles are not used; stop one of the two"
         else:
@@ -111,12 +109,9 @@ class BusWatch:
             return
         self._off_period.append(measured.period_s)
         if len(self._off_period) > 1:  # once may have been a stall
-            self._events.begin(
-                "period",
-                f"SYNC comes every {measured.period_s * 1e3:.4g} ms now, {used_s * 1e3:g} ms is in use: "
-                "cycles are lost or doubled until the master returns to it, or keeps to another one",
-                logging.ERROR,
-            )
+            text = f"SYNC comes every {measured.period_s * 1e3:.4g} ms now, {used_s * 1e3:g} ms is in use: "
+            text += "cycles are lost or doubled until the master returns to it, or keeps to another one"
+            self._events.begin("period", text, logging.ERROR)
         last = self._off_period[-_SURE:]
         if measured.steady and len(last) == _SURE and max(last) - min(last) < _ALIKE * min(last):
             self.on_period(measured.period_s)
@@ -147,12 +142,9 @@ class BusWatch:
         errors = self._loop.source.errors
         bus_offs, restarts = errors.get("bus-off", 0), errors.get("restarted", 0)
         if bus_offs > self._bus_offs:
-            self._events.begin(
-                "bus-off",
-                "the CAN controller is bus-off: check wiring, termination and bit rate; it stays so unless "
-                "restart-ms is set for the interface",
-                logging.ERROR,
-            )
+            text = "the CAN controller is bus-off: check wiring, termination and bit rate"
+            text += "; it stays so unless restart-ms is set for the interface"
+            self._events.begin("bus-off", text, logging.ERROR)
         if restarts > self._restarts:
             self._events.end("bus-off", "the CAN controller is on the bus again")
         self._bus_offs, self._restarts = bus_offs, restarts

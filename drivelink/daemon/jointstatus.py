@@ -124,9 +124,7 @@ class JointStatus:
             return "no SYNC"
         if status is None:
             return "waiting for samples" if loop.cycles else "starting"
-        if status & _STALE:
-            return "stale"
-        return "running"
+        return "stale" if status & _STALE else "running"
 
     def _bus(self) -> dict[str, Any]:
         section, source = self._joint.bus, self._loop.source
@@ -187,10 +185,7 @@ class JointStatus:
 
     def _real_time(self) -> dict[str, bool]:
         obtained = self.real_time
-        return {
-            "scheduling": obtained is not None and obtained.scheduling,
-            "memory": obtained is not None and obtained.memory,
-        }
+        return {name: getattr(obtained, name, False) for name in ("scheduling", "memory")}
 
     def summary(self) -> str:
         """Return the run in one line."""

@@ -89,7 +89,14 @@ class JointWatch:
         text = f"{name}: {found['text']}" if found is not None else ""
         over = f"{name}: no reading contradicts another"
         events.keep(f"contradiction {name}", found is not None, text, over)
-        self._check_readings(loop_joint, events)
+        suspicion = (
+            loop_joint.pipeline.estimator.suspicion() if loop_joint.pipeline.status is not None else None
+        )
+        if suspicion is None:
+            events.end(f"reading {name}", f"{name}: no reading is suspected")
+        elif suspicion["reason"] not in _BRIEF:
+            text = f"{name}: no valid estimates; suspected: {suspicion['text']}"
+            events.begin(f"reading {name}", text)
 
     def _check_model(self, loop_joint: LoopJoint, events: EventLog) -> None:
         """Report begin and end of the model alarm, its amount and what to do."""
@@ -112,17 +119,6 @@ class JointWatch:
             self._alarmed.discard(loop_joint.name)
             events.report(f"{loop_joint.name}: the model alarm is over")
 
-    def _check_readings(self, loop_joint: LoopJoint, events: EventLog) -> None:
-        """Report begin and end of a suspicion against a reading."""
-        suspicion = (
-            loop_joint.pipeline.estimator.suspicion() if loop_joint.pipeline.status is not None else None
-        )
-        key = f"reading {loop_joint.name}"
-        if suspicion is None:
-            events.end(key, f"{loop_joint.name}: no reading is suspected")
-        elif suspicion["reason"] not in _BRIEF:
-            events.begin(key, f"{loop_joint.name}: no valid estimates; suspected: {suspicion['text']}")
-
 
 def residual_text(monitor: ModelMonitor | None) -> str:
     """Return the residual against its baseline in words, if known."""
@@ -144,14 +140,13 @@ _NS = 1_000_000_000
 _HEARTBEATS_LOST = 3.5  # of them missing: the node is gone
 OPERATIONAL = 0x05
 _STATE_BITS, _ENABLED, _LIMIT = 0x6F, 0x27, 0x0800  # of the statusword (CiA 402-2, 8.4.2)
+_CONFLICTS = (
+    "different frames in one cycle are not used: does another device have its node ID or identifiers?"
+)
 _COUNTED = (  # counter of a node; its smallest reported increase, and the message: its end is not worth one
     ("missing", 1, "frames are missing"),
     ("wrong_length", 1, "frames of the wrong length are not used"),
-    (
-        "conflicting",
-        3,  # a single one may be a late frame
-        "different frames in one cycle are not used: does another device have its node ID or identifiers?",
-    ),
+    ("conflicting", 3, _CONFLICTS),  # a single one may be a late frame
 )
 
 
@@ -229,20 +224,13 @@ class WatchedNode:
 
     def check(self, events: EventLog, now: int) -> None:
         """Report changes of heartbeat, fault and statusword since the last call, at a time in ns."""
-        self._check_heartbeat(events, now)
-        node = self.layout.node_id
-        faulted, text = node in self.assembler.faults, f"node {node} reports a fault"
-        events.keep(f"fault {node}", faulted, text, f"node {node} reports no fault")
-        self._check_statusword(events)
-
-    def _check_heartbeat(self, events: EventLog, now: int) -> None:
-        node = self.layout.node_id
-        period_ms = self.layout.heartbeat_ms
-        age_ms = (now - self.heartbeat_ns) / 1e6
+        node, period_ms = self.layout.node_id, self.layout.heartbeat_ms
+        age_ms, text = (now - self.heartbeat_ns) / 1e6, f"node {node}: heartbeat"
         lost = bool(period_ms) and age_ms > max(_HEARTBEATS_LOST * period_ms, 50.0)
-        events.keep(
-            f"heartbeat {node}", lost, f"node {node}: heartbeat lost", f"node {node}: heartbeat is back"
-        )
+        events.keep(f"heartbeat {node}", lost, f"{text} lost", f"{text} is back")
+        faulted, text = node in self.assembler.faults, f"node {node} reports"
+        events.keep(f"fault {node}", faulted, f"{text} a fault", f"{text} no fault")
+        self._check_statusword(events)
 
     def _check_statusword(self, events: EventLog) -> None:
         """Report when a drive leaves operation enabled, or limits its set-point."""
@@ -254,10 +242,8 @@ class WatchedNode:
         if enabled:
             events.end(f"enabled {node}", f"node {node}: operation is enabled again")
         elif self.enabled:
-            state = drive_state(statusword)
-            events.begin(
-                f"enabled {node}", f"node {node} has left operation enabled ({state}): a brake may hold it"
-            )
+            text = f"node {node} has left operation enabled ({drive_state(statusword)}): a brake may hold it"
+            events.begin(f"enabled {node}", text)
         self.enabled = enabled
         text = f"node {node}: internal limit active (statusword bit 11)"
         over = f"node {node}: no internal limit is active"

@@ -69,21 +69,18 @@ def _rights(section: Section, capabilities: int) -> None:
 
 
 def _governor(section: Section) -> None:
-    governors = set()
-    for path in _CPU.glob("cpu[0-9]*/cpufreq/scaling_governor"):
-        governors.add(path.read_text(encoding="ascii", errors="replace").strip())
+    files = _CPU.glob("cpu[0-9]*/cpufreq/scaling_governor")
+    governors = {path.read_text(encoding="ascii", errors="replace").strip() for path in files}
     if not governors:
         section.ok("CPU clock", "not managed by this kernel")
     elif governors == {"performance"}:
         section.ok("CPU clock", "governor performance")
     else:
-        section.warn(
-            "CPU clock",
-            f"governor {', '.join(sorted(governors))}: the CPU clock first has to rise after each idle phase",
-            "sudo cpupower frequency-set -g performance",
+        text = (
+            f"governor {', '.join(sorted(governors))}: the CPU clock first has to rise after each idle phase"
         )
-    cores = os.cpu_count() or 1
-    if cores < 2:
+        section.warn("CPU clock", text, "sudo cpupower frequency-set -g performance")
+    if (os.cpu_count() or 1) < 2:
         section.warn("CPU", "one core only: everything else on it delays the cycle")
 
 
@@ -144,11 +141,8 @@ def judge_sync(
     if bus.sync == "produce":
         _judge_producer(section, text, daemons or Daemons(ours=False, others=()))
     elif "period_s" in bus.model_fields_set and abs(period_s - bus.period_s) > 0.02 * bus.period_s:
-        section.error(
-            "SYNC",
-            f"{text}, the joint file says {bus.period_s * 1000:g} ms",
-            f"bus.period_s = {round(period_s, 5):g}",
-        )
+        text += f", the joint file says {bus.period_s * 1000:g} ms"
+        section.error("SYNC", text, f"bus.period_s = {round(period_s, 5):g}")
     else:
         section.ok("SYNC", text)
 
@@ -165,11 +159,8 @@ def _judge_producer(section: Section, text: str, daemons: Daemons) -> None:
             'with another master: bus.sync = "follow"',
         )
     else:
-        section.warn(
-            "SYNC",
-            f"{text}: another master produces it, no drivelink daemon is alive",
-            'bus.sync = "follow", or stop the other master',
-        )
+        text += ": another master produces it, no drivelink daemon is alive"
+        section.warn("SYNC", text, 'bus.sync = "follow", or stop the other master')
 
 
 def daemon_mapping(joint: JointFile, base_dir: Path) -> Sequence[NodeLayout]:
@@ -219,11 +210,8 @@ def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> list[st
         return []
     section.ok("zenoh", f"{where}: reachable, alive: {', '.join(names)}")
     if joint.name in names:
-        section.info(
-            "zenoh",
-            f'a daemon for "{joint.name}" runs: a second one would be refused',
-            f"drivelink monitor {joint.name}",
-        )
+        text = f'a daemon for "{joint.name}" runs: a second one would be refused'
+        section.info("zenoh", text, f"drivelink monitor {joint.name}")
     return names
 
 
@@ -299,11 +287,8 @@ def judge_link(section: Section, link: dict[str, Any], bus: BusSection) -> None:
         _judge_controller(section, data, info, bus)
     queue = link.get("txqlen", 0)
     if queue < _GOOD_QUEUE:
-        section.warn(
-            name,
-            f"transmit queue of {queue} frames: SYNC may find it full (ENOBUFS)",
-            f"sudo ip link set {name} txqueuelen 1000",
-        )
+        text = f"transmit queue of {queue} frames: SYNC may find it full (ENOBUFS)"
+        section.warn(name, text, f"sudo ip link set {name} txqueuelen 1000")
     if link.get("mtu", 16) > 16:
         section.info(name, "CAN FD: FD frames are accepted, CANopen uses the classic ones")
     dropped = link.get("stats64", {}).get("rx", {}).get("dropped", 0)
@@ -312,40 +297,27 @@ def judge_link(section: Section, link: dict[str, Any], bus: BusSection) -> None:
 
 
 def _judge_controller(section: Section, data: dict[str, Any], info: dict[str, Any], bus: BusSection) -> None:
-    name = bus.channel
-    bitrate = data.get("bittiming", {}).get("bitrate", 0)
+    name, bitrate = bus.channel, data.get("bittiming", {}).get("bitrate", 0)
+    down, up = f"sudo ip link set {name} down", f"sudo ip link set {name} up"
     if bitrate and bitrate != bus.bitrate:
-        section.error(
-            name,
-            f"runs at {bitrate // 1000} kbit/s, the joint file says {bus.bitrate // 1000} kbit/s",
-            f"sudo ip link set {name} down && sudo ip link set {name} up type can bitrate {bus.bitrate}, "
-            f"or bus.bitrate = {bitrate}",
-        )
+        text = f"runs at {bitrate // 1000} kbit/s, the joint file says {bus.bitrate // 1000} kbit/s"
+        fix = f"{down} && {up} type can bitrate {bus.bitrate}, or bus.bitrate = {bitrate}"
+        section.error(name, text, fix)
     elif bitrate:
         section.ok(name, f"{bitrate // 1000} kbit/s")
-    state = data.get("state", "ERROR-ACTIVE")
-    counters = data.get("berr_counter", {})
+    state, counters = data.get("state", "ERROR-ACTIVE"), data.get("berr_counter", {})
     errors = f"error counters: tx {counters.get('tx', 0)}, rx {counters.get('rx', 0)}"
     if state == "ERROR-ACTIVE":
         section.ok(name, f"error-active, {errors}")
     else:
-        severity = Severity.ERROR if state in ("BUS-OFF", "STOPPED") else Severity.WARNING
-        section.add(
-            severity,
-            name,
-            f"is {state.lower()}, {errors}: check cable, termination (2 x 120 Ω), bit rate, and that "
-            "another node is powered",
-            f"sudo ip link set {name} down && sudo ip link set {name} up"
-            if severity is Severity.ERROR
-            else "",
-        )
+        off = state in ("BUS-OFF", "STOPPED")
+        text = f"is {state.lower()}, {errors}: check cable, termination (2 x 120 Ω), bit rate, and that "
+        text += "another node is powered"
+        severity = Severity.ERROR if off else Severity.WARNING
+        section.add(severity, name, text, f"{down} && {up}" if off else "")
     if not data.get("restart_ms"):
-        section.warn(
-            name,
-            "does not recover from bus-off by itself",
-            f"sudo ip link set {name} down && sudo ip link set {name} type can restart-ms 100 && "
-            f"sudo ip link set {name} up",
-        )
+        fix = f"{down} && sudo ip link set {name} type can restart-ms 100 && {up}"
+        section.warn(name, "does not recover from bus-off by itself", fix)
     offs = info.get("info_xstats", {}).get("bus_off", 0)
     if offs:
         section.warn(name, f"was bus-off {offs} times since it is up")

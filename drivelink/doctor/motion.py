@@ -95,11 +95,8 @@ def judge_motion(section: Section, survey: NodeSurvey, readings: Readings) -> bo
     times, moved = series.times_s, series.values
     section.facts[f"{subject} travel_rad"] = max(moved) - min(moved)
     if max(moved) - min(moved) < _LEAST_COUNTS * abs(position.scale):
-        section.info(
-            subject,
-            "stands still: signs and units could not be checked against each other",
-            "turn the joint by hand during the check (--seconds 10: more time), or drivelink doctor --move",
-        )
+        fix = "turn the joint by hand during the check (--seconds 10: more time), or drivelink doctor --move"
+        section.info(subject, "stands still: signs and units could not be checked against each other", fix)
         return False
     velocity = readings.get((Signal.MOTOR_VELOCITY, motor))
     windows = _windows(times)
@@ -138,17 +135,11 @@ def _judge_velocity(section: Section, subject: str, key: str, ratio: float) -> N
     if abs(ratio - 1) <= _TOLERANCE:
         section.ok(subject, f"velocity agrees with the differences of positions (ratio {ratio:.3f})")
     elif ratio < 0:
-        section.warn(
-            subject,
-            f"{text}: they have opposite signs",
-            "bits 7 and 6 of the polarity 0x607E, with the maker's tool",
-        )
+        fix = "bits 7 and 6 of the polarity 0x607E, with the maker's tool"
+        section.warn(subject, f"{text}: they have opposite signs", fix)
     else:
-        section.warn(
-            subject,
-            f"{text}: counts_per_rev or the velocity unit is wrong",
-            f"correct {key}: counts_per_rev, or velocity_rad_s_per_count",
-        )
+        fix = f"correct {key}: counts_per_rev, or velocity_rad_s_per_count"
+        section.warn(subject, f"{text}: counts_per_rev or the velocity unit is wrong", fix)
 
 
 def _judge_link(section: Section, subject: str, ratio: float) -> None:

@@ -79,11 +79,8 @@ def _ask(
     others = [node for node in sorted(set(found) | set(traffic.heartbeats)) if node not in mine]
     ends = shares(len(mine) + 1)
     if not found:
-        section.error(
-            joint.bus.channel,
-            "no node answers or sends",
-            "power the drives; check cable, termination, bit rate and node ids",
-        )
+        fix = "power the drives; check cable, termination, bit rate and node ids"
+        section.error(joint.bus.channel, "no node answers or sends", fix)
     layouts, surveys = [], {}
     for role in mine.values():
         if role.node_id in found:
@@ -93,11 +90,8 @@ def _ask(
             if survey is not None:
                 surveys[own.title] = survey
         else:
-            section.error(
-                role.subject,
-                f"({role.key}) does not answer" + (f", only {_list(others)}" if others else ""),
-                f"power it, or correct {role.key}.node_id",
-            )
+            text = f"({role.key}) does not answer" + (f", only {_list(others)}" if others else "")
+            section.error(role.subject, text, f"power it, or correct {role.key}.node_id")
     _name_others(section, bus, joint.bus, others, next(ends))
     _judge_load(section, layouts, joint.bus)
     if surveys:
@@ -298,11 +292,8 @@ def _overhear(
             if not count:
                 section.warn(f"node {node}", f"0x{tpdo.cob_id:03X} was not heard")
             elif length < tpdo.length:
-                section.error(
-                    f"node {node}",
-                    f"0x{tpdo.cob_id:03X} has {length} bytes, its mapping {tpdo.length}",
-                    "correct the mapping in the joint file or its EDS",
-                )
+                text = f"0x{tpdo.cob_id:03X} has {length} bytes, its mapping {tpdo.length}"
+                section.error(f"node {node}", text, "correct the mapping in the joint file or its EDS")
             else:
                 section.ok(f"node {node}", f"0x{tpdo.cob_id:03X} heard {count} times")
     _judge_load(section, list(configurator.layouts.values()), joint.bus)
@@ -320,9 +311,6 @@ def _judge_traffic(section: Section, traffic: Traffic, bus: BusSection, daemons:
     section.facts["frames_per_s"] = frames / traffic.seconds if traffic.seconds else 0.0
     section.facts["identifiers"] = {f"0x{cob:03X}": n for cob, n in sorted(traffic.counts.items())}
     if traffic.error_frames:
-        section.warn(
-            bus.channel,
-            f"{traffic.error_frames} error frames in {traffic.seconds:g} s",
-            "check cable, termination (2 x 120 Ω) and that all nodes have the same bit rate",
-        )
+        fix = "check cable, termination (2 x 120 Ω) and that all nodes have the same bit rate"
+        section.warn(bus.channel, f"{traffic.error_frames} error frames in {traffic.seconds:g} s", fix)
     judge_sync(section, traffic.sync_s, bus, daemons)

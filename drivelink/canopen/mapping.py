@@ -216,12 +216,10 @@ class Mapper:
             if subindex == 2 and abort.code in _NOT_NOW:
                 raise  # not essential, unlike transmission at SYNC
             old = ": its values may be older than their SYNC" if subindex == 2 else ""
-            self.findings.add(
-                Severity.WARNING if subindex == 2 else Severity.INFO,
-                self.role.subject,
-                f"TPDO{tpdo.number} keeps {_TIMING_NAMES[subindex]} {has} instead of {wanted}{old} "
-                f"(SDO abort {abort_text(abort.code)})",
-            )
+            text = f"TPDO{tpdo.number} keeps {_TIMING_NAMES[subindex]} {has} instead of {wanted}{old}"
+            severity = Severity.WARNING if subindex == 2 else Severity.INFO
+            text = f"{text} (SDO abort {abort_text(abort.code)})"
+            self.findings.add(severity, self.role.subject, text)
             return False
         return True
 

@@ -64,11 +64,9 @@ def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
         _offer_link(role, role.encoder, reported, result)
         if vendor.sensorless == _encoder_address(role.encoder, role.key) and role.encoder.object is None:
             index, subindex = vendor.sensorless
-            result.warn(
-                role.subject,
-                f"0x{index:04X}:{subindex:02X} is {vendor.name}'s sensorless position, no encoder",
-                f'link.encoder.object = "0x{index:04X}:{subindex + 1:02X}" for the one wired to it',
-            )
+            text = f"0x{index:04X}:{subindex:02X} is {vendor.name}'s sensorless position, no encoder"
+            fix = f'link.encoder.object = "0x{index:04X}:{subindex + 1:02X}" for the one wired to it'
+            result.warn(role.subject, text, fix)
     return result
 
 
@@ -117,10 +115,10 @@ class _Drive:
                 self._result.missing[Signal.MOTOR_POSITION] = text
             return stated if chosen is None else chosen
         if reported == 1.0 and stated != 1.0:  # usual: the drive was never configured with its gear
-            self._result.info(
-                self._role.subject,
-                f"gear ratio: the drive says 1 ({source}), the joint file {stated:.6g}; {stated:.6g} is used",
+            text = (
+                f"gear ratio: the drive says 1 ({source}), the joint file {stated:.6g}; {stated:.6g} is used"
             )
+            self._result.info(self._role.subject, text)
             return stated
         self._choose("gear ratio", "gear_ratio", reported, source)
         return stated
@@ -148,11 +146,8 @@ class _Drive:
         scale = self._drive.direction * math.tau / (counts * gear)
         feed = _ratio(self._reported, (0x6092, 1), (0x6092, 2))
         if feed is not None and feed > 1 and not math.isclose(feed, counts * gear, rel_tol=_SAME):
-            self._result.info(
-                self._role.subject,
-                f"feed constant 0x6092 says {feed:.6g} units per shaft revolution, "
-                f"encoder and gear {counts * gear:.6g}; {counts * gear:.6g} is used",
-            )
+            text = f"feed constant 0x6092 says {feed:.6g} units per shaft revolution, encoder and gear "
+            self._result.info(self._role.subject, f"{text}{counts * gear:.6g}; {counts * gear:.6g} is used")
         self._result.candidates[Signal.MOTOR_POSITION] = (
             _object(Signal.MOTOR_POSITION, (0x6064, 0), 32, scale, wraps=True),
         )
@@ -283,18 +278,13 @@ class _Drive:
 
     def _polarity(self) -> None:
         polarity = self._reported.get((0x607E, 0), 0)
+        subject, text = self._role.subject, f"polarity 0x607E is 0x{polarity:02X}: "
         if polarity & 0x80:
-            self._result.info(
-                self._role.subject,
-                f"polarity 0x607E is 0x{polarity:02X}: the drive itself turns the position's sign; "
-                f"direction = {self._drive.direction} applies to what it reports",
-            )
+            applies = f"direction = {self._drive.direction} applies to what it reports"
+            self._result.info(subject, f"{text}the drive itself turns the position's sign; {applies}")
         if bool(polarity & 0x80) != bool(polarity & 0x40):
-            self._result.warn(
-                self._role.subject,
-                f"polarity 0x607E is 0x{polarity:02X}: position and velocity have opposite signs",
-                "set bits 7 and 6 of 0x607E alike with the maker's tool",
-            )
+            fix = "set bits 7 and 6 of 0x607E alike with the maker's tool"
+            self._result.warn(subject, f"{text}position and velocity have opposite signs", fix)
 
 
 def _chosen(
@@ -307,12 +297,9 @@ def _chosen(
         result.warn(role.subject, text, f"{key} = …, or correct {source} in the node")
         return stated
     if stated is not None and reported is not None and not math.isclose(stated, reported, rel_tol=_SAME):
-        result.warn(
-            role.subject,
-            f"{what}: the node says {reported:.6g} ({source}), the joint file {stated:.6g}; "
-            f"{stated:.6g} is used",
-            f"{key} = {reported:.6g}, or leave it out, or correct {source} in the node",
-        )
+        text = f"{what}: the node says {reported:.6g} ({source}), the joint file {stated:.6g}"
+        fix = f"{key} = {reported:.6g}, or leave it out, or correct {source} in the node"
+        result.warn(role.subject, f"{text}; {stated:.6g} is used", fix)
     return reported if stated is None else stated
 
 

@@ -231,11 +231,8 @@ class Supervisor:
     def _report_unstarted(self, node: int, watched: WatchedNode) -> None:
         code = watched.loop_joint.pipeline.assembler.faults.get(node)
         why = f" and EMCY 0x{code:04X}: its error may need a reset or a power cycle" if code else ""
-        self._of(node).begin(
-            f"start {node}",
-            f"node {node} is configured and was started, but sends none of its frames; "
-            f"it says {nmt_state(watched.state)}{why}",
-        )
+        text = f"node {node} is configured and was started, but sends none of its frames; it says "
+        self._of(node).begin(f"start {node}", f"{text}{nmt_state(watched.state)}{why}")
 
     def _heartbeat(self, cob_id: int, data: bytes) -> None:
         if len(data) != 1:

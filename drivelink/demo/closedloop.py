@@ -197,25 +197,17 @@ def found_values(report: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
 def result(name: str, run: ClosedLoop, summary: RunSummary) -> dict[str, Any]:
     """Return a run as a JSON object; missing numbers are null."""
     times, begin = run.times, run.times.get("changed")
-    document: dict[str, Any] = {
-        "case": name,
-        "cycles": summary.cycles,
-        "missed_cycles": summary.missed_cycles,
+    about = {"case": name, "cycles": summary.cycles, "missed_cycles": summary.missed_cycles}
+    document: dict[str, Any] = about | {
+        f"{step}_s": round(times[step] - begin, 3) if begin and step in times else None for step in STEPS
     }
-    for step in STEPS:
-        document[f"{step}_s"] = round(times[step] - begin, 3) if begin and step in times else None
-    report = run.offer.finding["report"] if run.offer is not None else {}
-    values = found_values(report)
+    offered = run.offer.finding if run.offer is not None else {}
+    values = found_values(offered.get("report") or {})
     document["parameters"] = {
-        key: {
-            "truth": truth,
-            "found": values.get(key, (None, None))[0],
-            "std": values.get(key, (None, None))[1],
-        }
+        key: {"truth": truth, **dict(zip(("found", "std"), values.get(key, (None, None)), strict=True))}
         for key, truth in CASES[name].truth.items()
     }
-    document["sentence"] = run.offer.finding["sentence"] if run.offer is not None else None
-    document["error"] = run.offer.finding["error"] if run.offer is not None else None
+    document |= {key: offered.get(key) for key in ("sentence", "error")}
     document["residual_ratio"] = max(run.trial.ratios) if run.trial is not None and run.trial.ratios else None
     return document
 

@@ -103,10 +103,9 @@ def _time(value: Any) -> datetime | None:
         return value if value.tzinfo else value.replace(tzinfo=UTC)
     if isinstance(value, int | float):
         return datetime.fromtimestamp(value, UTC)
-    try:
+    with suppress(ValueError):
         return parsedate_to_datetime(str(value))
-    except ValueError:
-        return None
+    return None
 
 
 def _opened(url: str) -> tuple[Any, str]:

@@ -288,18 +288,12 @@ def recorded_time(path: Path, source: Source, joint: JointFile | None = None) ->
         frame = next(iter(read_frames(path, configured=joint.bus.channel if joint else "")), None)
         stamp_s = frame.stamp_ns * 1e-9 if frame else 0.0
     elif suffix == ".csv":
-        stamp_s = _first_time(path, joint)
+        with suppress(DrivelinkError, KeyError, IndexError, StopIteration):
+            names = column_map(joint, None)
+            stamp_s = float(renamed(first_row(path, names), names, path.name)["time_s"][0])
     if _UNIX < stamp_s < 1e11:
         return datetime.fromtimestamp(stamp_s, UTC)
     return named_time(source) or source.modified
-
-
-def _first_time(path: Path, joint: JointFile | None) -> float:
-    """`time_s` of the first row of a CSV; 0 if not found."""
-    with suppress(DrivelinkError, KeyError, IndexError, StopIteration):
-        names = column_map(joint, None)
-        return float(renamed(first_row(path, names), names, path.name)["time_s"][0])
-    return 0.0
 
 
 def _declared_limit() -> float:

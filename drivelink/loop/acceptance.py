@@ -74,11 +74,10 @@ def proposal(path: Path) -> Proposal:
         )
     recording, found = newest
     if found["state"] != finding.PROPOSED:
-        state, said = found["state"], f"nothing to accept: {found['sentence']}"
+        state = found["state"]
+        said = f"nothing to accept{'' if state == finding.NOTHING else f', {state}'}: {found['sentence']}"
         if state == finding.ACCEPTED:
             said = f"accepted already; drivelink accept {path} --undo puts the old joint file back"
-        elif state != finding.NOTHING:
-            said = f"nothing to accept, {state}: {found['sentence']}"
         raise RecordingError(f"{recording.name}: {said}")
     if found.get("joint_file") != fingerprint(source.text):
         raise RecordingError(
@@ -99,11 +98,8 @@ def accept(offer: Proposal) -> Path:
     """
     path, now = _place(offer.source), datetime.now(UTC)
     old = _keep(offer.source, f"{now:{_STAMP}}")
-    accepted = {
-        "time": now.isoformat(timespec="seconds"),
-        "before": old.name,
-        "recording": offer.recording.name,
-    }
+    about = {"before": old.name, "recording": offer.recording.name}
+    accepted = {"time": now.isoformat(timespec="seconds")} | about
     write_model(offer.proposed, path, {"provenance": {"accepted": accepted}}, force=True)
     with suppress(RecordingError):  # of a full disk: the joint file says it, too
         finding.write(offer.recording, {**offer.finding, "state": finding.ACCEPTED, "accepted": accepted})
@@ -207,10 +203,8 @@ class Trial:
             return self.fallen
         if self.in_use:
             self._judge(status)
-        if self._quiet >= _QUIET_SECONDS:
-            self.fallen = True
-        elif now_s >= self._end_s:
-            self.fallen = False
+        if self._quiet >= _QUIET_SECONDS or now_s >= self._end_s:
+            self.fallen = self._quiet >= _QUIET_SECONDS
         return self.fallen
 
     def _judge(self, status: Mapping[str, Any]) -> None:

@@ -140,10 +140,8 @@ def _network(channel: str, bitrate: int) -> dict[Path, str]:
 
 def _python() -> Iterable[Path]:
     """Directories of Python and the package."""
-    yield Path(sys.prefix)
-    yield Path(sys.base_prefix)
-    yield Path(sysconfig.get_paths()["purelib"])
-    yield Path(drivelink.__file__).resolve().parent.parent
+    package = Path(drivelink.__file__).resolve().parent.parent
+    return Path(sys.prefix), Path(sys.base_prefix), Path(sysconfig.get_paths()["purelib"]), package
 
 
 def _hidden(places: Iterable[Path]) -> list[Path]:

@@ -142,19 +142,13 @@ class Fit:
         return harm_of_parts(declared, written, self.runs.records, make, self.runs.source.joint.estimator)
 
     def _require_stiffness(self) -> None:
-        named = self.runs.named
         flexible = [(i, one) for i, one in enumerate(self.found.fits, start=1) if one.model != RIGID]
-        for number, one in flexible:
-            if not one.excited:
-                raise RecordingError(
-                    f"{named}: --write: expected a motion that determines the stiffness of motor {number}"
-                )
-        for number, one in flexible:
-            if not one.stiffens:
-                raise RecordingError(
-                    f"{named}: --write: expected a stiffness above zero, interval included, over all "
-                    f"deflections of the recording; that of motor {number} is not"
-                )
+        for number in (number for number, one in flexible if not one.excited):
+            text = f"expected a motion that determines the stiffness of motor {number}"
+            raise RecordingError(f"{self.runs.named}: --write: {text}")
+        for number in (number for number, one in flexible if not one.stiffens):
+            text = "expected a stiffness above zero, interval included, over all deflections of the recording"
+            raise RecordingError(f"{self.runs.named}: --write: {text}; that of motor {number} is not")
 
     @cached_property
     def free_runs(self) -> list[dict[str, FreeRun]]:

@@ -269,19 +269,16 @@ def appearance(found: NDArray[np.bool_]) -> Appearance:
     k = np.arange(1, n)
     after = total - np.cumsum(found)[:-1]
     p = np.asarray(hypergeom.sf(after - 1, n, total, n - k))
-    best = int(np.argmin(p))
-    first = int(k[best])
-    return Appearance(
-        min(1.0, float(p[best]) * (n - 1)), first, float(found[:first].mean()), float(found[first:].mean())
-    )
+    first, least = int(k[np.argmin(p)]), float(np.min(p))
+    rates = float(found[:first].mean()), float(found[first:].mean())
+    return Appearance(min(1.0, least * (n - 1)), first, *rates)
 
 
 def usable(row: dict[str, Any]) -> bool:
     """Return whether a row has a usable stiffness."""
     value, std = row["stiffness_middle_nm_rad"], row["stiffness_std_middle_nm_rad"]
-    return bool(
-        row["status"] == "done" and row["excited"] and value is not None and value > 0.0 and std is not None
-    )
+    known = value is not None and value > 0.0 and std is not None
+    return bool(row["status"] == "done" and row["excited"] and known)
 
 
 def unusable(rows: list[dict[str, Any]], shown: set[tuple[str, int]]) -> list[dict[str, Any]]:

@@ -88,10 +88,9 @@ class Joints:
             written = _written(joint.provenance)
             one = Joint(joint.name, given.text, str(path), _eds(joint, path.parent))
             if joint.name in best and best[joint.name][0] == written:
-                raise FleetError(
-                    f"{path}: joint {joint.name} is in {best[joint.name][1].where} too; expected one file, "
-                    "or [provenance] of fit --write or diagnose --write that says which is newer"
-                )
+                there = f"joint {joint.name} is in {best[joint.name][1].where} too"
+                newer = "[provenance] of fit --write or diagnose --write that says which is newer"
+                raise FleetError(f"{path}: {there}; expected one file, or {newer}")
             if joint.name not in best or written > best[joint.name][0]:
                 best[joint.name] = (written, one)
         return cls({name: one for name, (_, one) in best.items()})
@@ -150,11 +149,9 @@ def _written(provenance: dict[str, Any]) -> str:
 
 
 def _eds(joint: JointFile, base: Path) -> tuple[tuple[str, bytes], ...]:
-    names = {motor.drive.eds for motor in joint.motor if motor.drive and motor.drive.eds}
-    if joint.link.encoder and joint.link.encoder.eds:
-        names.add(joint.link.encoder.eds)
+    devices = (*(motor.drive for motor in joint.motor), joint.link.encoder)
     found = []
-    for name in sorted(names):
+    for name in sorted({device.eds for device in devices if device and device.eds}):
         if Path(name).is_absolute() or ".." in Path(name).parts:
             continue  # only paths below the joint file can be recreated elsewhere
         with raised_as(DrivelinkError, f"{base / name}: cannot be read"):

@@ -120,11 +120,8 @@ def _styles(joints: Sequence[dict[str, Any]]) -> str:
 def _about(document: dict[str, Any]) -> str:
     days = f", {document['from'][:10]} to {document['to'][:10]}" if document["from"] else ""
     broken = len(document["broken"])
-    return (
-        f"{document['recordings']} recordings{days}"
-        + (f"; {broken} could not be used" if broken else "")
-        + "."
-    )
+    unused = f"; {broken} could not be used" if broken else ""
+    return f"{document['recordings']} recordings{days}{unused}."
 
 
 def _line(joint: dict[str, Any], order: str, linked: bool) -> str:

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from itertools import islice, pairwise
 from multiprocessing import resource_tracker
 from types import FrameType
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import dask
 from dask.utils import parse_bytes
@@ -176,8 +176,7 @@ def _window(client: Client) -> int:
 
 def _outcome(future: Any, task: Task) -> Outcome:
     if future.status == "finished":
-        outcome: Outcome = future.result()
-        return outcome
+        return cast("Outcome", future.result())
     if future.status in _LOST:
         raise FleetError("the scheduler is gone; what was finished is in the table")
     error = future.exception()
@@ -226,8 +225,7 @@ def _client(settings: Settings, tasks: int) -> Iterator[Client]:
         with _local(settings, tasks) as client:
             yield client
         return
-    client = _remote(settings.scheduler, settings.insecure)
-    with client:
+    with _remote(settings.scheduler, settings.insecure) as client:
         _check_workers(client, settings.scheduler)
         yield client
 
@@ -314,9 +312,8 @@ def _check_workers(client: Client, address: str) -> None:
         raise FleetError(f"--scheduler {address}: {why}") from error
     for worker, version in versions.items():
         if version != __version__:
-            raise FleetError(
-                f"--scheduler {address}: worker {worker} has drivelink {version}, not {__version__}"
-            )
+            has = f"worker {worker} has drivelink {version}"
+            raise FleetError(f"--scheduler {address}: {has}, not {__version__}")
 
 
 def _worker_version() -> str:

@@ -126,12 +126,8 @@ def _places(rows: list[dict[str, Any]]) -> list[_Place]:
 
 def _effect(place: _Place, q: float, level: float) -> dict[str, Any]:
     shown = place.best if level else place.names
-    names = set(shown)
-    seen = [
-        row
-        for row in place.rows
-        if names & {n.partition("@")[0] for n in row["effects"] if n.endswith(f"@{place.place}")}
-    ]
+    named = {f"{name}@{place.place}" for name in shown}
+    seen = [row for row in place.rows if named & set(row["effects"])]
     before, after = (
         float(np.median([row[f"error_{when}_relative"] for row in seen])) for when in ("before", "after")
     )
@@ -234,9 +230,8 @@ def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: lis
             said.append(f"New at the {spaced(effect['location'])} since {effect['since'][:10]}: {names}.")
     if gone:
         which = "recording shows" if len(gone) == 1 else f"{len(gone)} recordings show"
-        said.insert(
-            0, f"The last {which} no stiffness, from {gone[0]['time'][:10]} on: {gone[-1]['reason']}."
-        )
+        since = gone[0]["time"][:10]
+        said.insert(0, f"The last {which} no stiffness, from {since} on: {gone[-1]['reason']}.")
         if state == "lost" and last is not None and last["verdict"] not in _NO_PLACE:
             before = "" if last is rows[-1] else "The last one that could be used says: "
             said.append(f"{before}{last['sentence']}")
@@ -257,12 +252,11 @@ def _sentence(state: str, judged: _Judged, rows: list[dict[str, Any]], gone: lis
 
 def _earlier(effects: list[dict[str, Any]]) -> str:
     """What recordings before a sufficient one lacked, significant or not."""
-    each = [
+    return ", ".join(
         f"{' or '.join(map(in_words, one['names'][:2]))} ({spaced(one['location'])}) was missing in "
         f"{one['recordings']} of {one['of']}"
         for one in effects
-    ]
-    return ", ".join(each)
+    )
 
 
 def _found(rows: list[dict[str, Any]]) -> str:
@@ -284,9 +278,8 @@ def _moved(one: dict[str, Any], change: dict[str, Any]) -> tuple[str, str]:
     """Return what has changed, and by how much."""
     if "causes" in change:
         amount, half, unit = 100.0 * change["amount_relative"], 100.0 * change["amount_std_relative"], "%"
-        what = " or ".join(
-            "the torque's scale" if c == "torque_scale" else in_words(c) for c in change["causes"]
-        )
+        scale = {"torque_scale": "the torque's scale"}
+        what = " or ".join(scale.get(cause) or in_words(cause) for cause in change["causes"])
     else:
         amount, half, unit = change["amount"], change["amount_std"], one["unit"]
         what = parameter_name(one["name"])

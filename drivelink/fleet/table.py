@@ -251,8 +251,7 @@ def _batches(content: bytes, schema: Any, where: str) -> Iterator[Any]:
 
 
 def _bytes(table: Any) -> bytes:
-    sink = io.BytesIO()
-    pq.write_table(table, sink, compression="zstd")
+    pq.write_table(table, sink := io.BytesIO(), compression="zstd")
     return sink.getvalue()
 
 

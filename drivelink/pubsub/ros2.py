@@ -23,15 +23,12 @@ from drivelink.pubsub.session import Stream, one_line
 from drivelink.pubsub.wire import EXTERNAL_COLUMNS
 from estimator.sample import Estimate, External, ExternalStatus, Status
 
+_DIAGNOSTIC_HASH = "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
 _TYPES = (  # package, message, and the hash of its definition
     ("sensor_msgs", "JointState", "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"),
     ("std_msgs", "Float64MultiArray", "1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f"),
     ("control_msgs", "DynamicJointState", "18024c98a62697680f581108eeed40b28fb4542fa0ac5a8e36f56c62b6813d26"),
-    (
-        "diagnostic_msgs",
-        "DiagnosticArray",
-        "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
-    ),
+    ("diagnostic_msgs", "DiagnosticArray", _DIAGNOSTIC_HASH),
     ("geometry_msgs", "WrenchStamped", "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77"),
 )
 TYPE_HASHES = {f"{package}::msg::dds_::{name}_": f"RIHS01_{digest}" for package, name, digest in _TYPES}
@@ -175,9 +172,8 @@ class _Topic:
         token = f"{node.token(next(_entities), 'MP')}/{_mangle(topic)}/{kind}/{type_hash}/{_QOS}"
         self._gid = xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
         self._sequence = 0
-        publisher = session.declare_publisher(
-            key, congestion_control=zenoh.CongestionControl.DROP, express=True
-        )
+        drop = zenoh.CongestionControl.DROP
+        publisher = session.declare_publisher(key, congestion_control=drop, express=True)
         self._stream = Stream(publisher)
         self.entities = (publisher, session.liveliness().declare_token(token))
 
@@ -236,11 +232,9 @@ class Ros2Publisher:
             self._stiffness = _Topic(session, node, f"{node.namespace}/{name}/stiffness", kinds[1])
             self._dynamic = _Topic(session, node, f"{node.namespace}/dynamic_joint_states", kinds[2])
             self._diagnostics = _Topic(session, node, "/diagnostics", kinds[3])
-            self._wrench = (
-                _Topic(session, node, f"{node.namespace}/{name}/external_torque", kinds[4])
-                if joint.link.dynamics is not None
-                else None
-            )
+            self._wrench = None
+            if joint.link.dynamics is not None:
+                self._wrench = _Topic(session, node, f"{node.namespace}/{name}/external_torque", kinds[4])
         except zenoh.ZError as error:
             raise ZenohError(f"ros2 of joint {joint.name}: {one_line(error)}") from error
         for topic in (self._states, self._stiffness, self._dynamic, self._diagnostics, self._wrench):

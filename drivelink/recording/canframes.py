@@ -58,11 +58,8 @@ def is_frame_log(path: Path, frames: bool | None = None) -> bool:
         return False
     if frames is not None:
         return frames
-    kinds = {
-        message.topic.rsplit("/", 1)[-1]
-        for message in islice(read_messages(path, frozenset({"sample", "can"})), _PEEK)
-    }
-    return kinds == {"can"}
+    messages = islice(read_messages(path, frozenset({"sample", "can"})), _PEEK)
+    return {message.topic.rsplit("/", 1)[-1] for message in messages} == {"can"}
 
 
 class FrameLog:
@@ -81,10 +78,9 @@ class FrameLog:
         self._most_judged = _FEW_MAPPINGS + most_records(size) // _RECORDS_OF_A_MAPPING
 
         def frames() -> Iterator[LoggedFrame]:
-            mcap = path.suffix.lower() == ".mcap"
-            return (
-                in_order(_mcap_frames(path), path) if mcap else read_frames(path, channel, joint.bus.channel)
-            )
+            if path.suffix.lower() == ".mcap":
+                return in_order(_mcap_frames(path), path)
+            return read_frames(path, channel, joint.bus.channel)
 
         self._frames = frames()
         self._follow = joint.bus.sync == "follow"
@@ -116,8 +112,7 @@ class FrameLog:
         numbered = numbered_at_once if self._follow else numbered_ahead
         for frames, jump in numbered(chain(self._head, self._frames), self.period_s):
             if not samples:
-                for frame in frames:
-                    heard.add(frame[1])
+                heard.update(frame[1] for frame in frames)
             for cycle in assembly.cycles(frames, jump):
                 samples = samples or cycle.sample is not None
                 yield cycle
@@ -137,15 +132,14 @@ class FrameLog:
 
     def _absent(self, heard: set[int]) -> str:
         """Frames of the mapping that are missing."""
-        absent = [
+        absent = ", ".join(
             f"0x{tpdo.cob_id:03X} of node {layout.node_id}"
             for layout in self._listener.layouts.values()
             for tpdo in layout.tpdos
             if tpdo.cob_id not in heard
-        ]
-        if not absent:
-            return ""
-        return f": expected frames {', '.join(absent)}, got none (another node id, channel or mapping?)"
+        )
+        why = "(another node id, channel or mapping?)"
+        return f": expected frames {absent}, got none {why}" if absent else ""
 
     def _learn_configuration(self) -> tuple[list[int], bool, bool]:
         """Read the SDO transfers until the mapping is known and unchanged for a while.

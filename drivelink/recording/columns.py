@@ -82,9 +82,8 @@ def column_map(joint: JointFile | None, asked: ColumnMap | None) -> ColumnMap:
     } | dict(asked or {})
     for name, source in found.items():
         if joint is not None and not suits(source.unit, joint.axis):
-            raise UsageError(
-                f"{name}: {source.unit} is no unit of a {joint.axis} axis: give the factor to SI"
-            )
+            fix = f"is no unit of a {joint.axis} axis: give the factor to SI"
+            raise UsageError(f"{name}: {source.unit} {fix}")
     return found
 
 
@@ -100,11 +99,7 @@ def renamed(
     Raises:
         RecordingError: a source is missing.
     """
-    names = {
-        name: source
-        for name, source in names.items()
-        if source.asked or source.column in columns or name not in columns
-    }
+    names = {n: s for n, s in names.items() if s.asked or s.column in columns or n not in columns}
     for name, source in names.items():
         if source.column not in columns:
             by = f"--map {source.column}={name}" if source.asked else f"recording.columns.{name}"
@@ -349,8 +344,8 @@ def _usable(needed: Sequence[FloatArray], where: str) -> NDArray[np.bool_]:
     usable: NDArray[np.bool_] = np.all(np.isfinite(needed), axis=0)
     if lost := int(np.count_nonzero(~usable)):
         _LOG.warning("%s: taken as gaps: %s with missing values", where, counted(lost, "row"))
-    if int(np.count_nonzero(usable)) < 3:
-        raise RecordingError(f"{where}: expected at least 3 complete samples, got {np.count_nonzero(usable)}")
+    if len(usable) - lost < 3:
+        raise RecordingError(f"{where}: expected at least 3 complete samples, got {len(usable) - lost}")
     return usable
 
 

@@ -151,8 +151,7 @@ def corrections(joint: JointFile, needed: Sequence[Change], *, live: bool) -> li
         live: correct the keys of drives and encoder, used by `run` and recordings of frames; else the factors
             of `[recording]`, used by files with columns.
     """
-    changes = {change.channel: change for change in needed}
-    found: list[Correction] = []
+    changes, found = {change.channel: change for change in needed}, list[Correction]()
     for number, motor in enumerate(joint.motor, start=1):
         position, torque = changes.get(f"motor{number}_position"), changes.get(f"motor{number}_torque")
         inertia = changes.get(f"motor{number}_inertia")

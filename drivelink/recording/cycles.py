@@ -153,11 +153,10 @@ class FrameSamples:
 
     def _made(self, numbered: Iterable[Numbered]) -> list[tuple[Sample, int]]:
         found = []
-        for frames, jump in numbered:
-            for frame in frames:
-                assembly = self._assembly or self._begun(frame.can_id, frame.data, frame.stamp_ns * 1e-9)
-                made = () if assembly is None else assembly.cycles((frame,), jump)
-                found += [(cycle.sample, cycle.stamp_ns) for cycle in made if cycle.sample is not None]
+        for frame, jump in ((frame, jump) for frames, jump in numbered for frame in frames):
+            assembly = self._assembly or self._begun(frame.can_id, frame.data, frame.stamp_ns * 1e-9)
+            made = () if assembly is None else assembly.cycles((frame,), jump)
+            found += [(cycle.sample, cycle.stamp_ns) for cycle in made if cycle.sample is not None]
         return found
 
     def _begun(self, can_id: int, data: bytes, now_s: float) -> Assembly | None:

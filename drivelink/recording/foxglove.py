@@ -70,27 +70,18 @@ def _foxglove(joint: str, plots: Sequence[tuple[str, str, list[str]]]) -> str:
         }
         for number, (title, topic, fields) in enumerate(plots)
     }
-    document = {
-        "configById": panels,
-        "globalVariables": {},
-        "userNodes": {},
-        "playbackConfig": {"speed": 1},
-        "layout": _column(list(panels)),
-    }
+    document: dict[str, Any] = {"configById": panels, "globalVariables": {}, "userNodes": {}}
+    document |= {"playbackConfig": {"speed": 1}, "layout": _column(list(panels))}
     return json.dumps(document, indent=1) + "\n"
 
 
 def _column(panels: list[str]) -> object:
     """Stack panels of equal height."""
-    if len(panels) == 1:
-        return panels[0]
-    share = 100.0 / len(panels)
-    return {
-        "first": panels[0],
-        "second": _column(panels[1:]),
-        "direction": "column",
-        "splitPercentage": round(share, 1),
-    }
+    first, *others = panels
+    if not others:
+        return first
+    split = {"direction": "column", "splitPercentage": round(100.0 / len(panels), 1)}
+    return {"first": first, "second": _column(others), **split}
 
 
 def _plotjuggler(joint: str, plots: Sequence[tuple[str, str, list[str]]]) -> str:

@@ -109,10 +109,7 @@ class AscText(io.TextIOBase):
         Raises:
             RecordingError: it is too long.
         """
-        line = next(self._lines, None)
-        return "" if line is None else self._known(line.decode(errors="replace"))
-
-    def _known(self, line: str) -> str:
+        line = next(self._lines, b"").decode(errors="replace")
         if _RELATIVE.match(line):
             self._relative = True
         elif self._relative and (stamp := _STAMP.match(line)):

@@ -225,18 +225,16 @@ class Publication:
             wait_ns = due_ns - time.monotonic_ns()
             if wait_ns > 0:
                 time.sleep(wait_ns * 1e-9)
-        if self._publisher is None:
-            return
-        stamp_ns = self._begin_unix_ns + round(passed_s / (self._speed or 1.0) * 1e9)
-        self._publisher.put(played.tick.stamped(stamp_ns))
+        if self._publisher is not None:
+            stamp_ns = self._begin_unix_ns + round(passed_s / (self._speed or 1.0) * 1e9)
+            self._publisher.put(played.tick.stamped(stamp_ns))
         if passed_s >= self._status_due_s:
             self._status_due_s = passed_s + _STATUS_EVERY_S * (self._speed or 1.0)
             self._status("replay", passed_s)
 
     def close(self) -> None:
         """Publish the end of the replay."""
-        if self._publisher is not None:
-            self._status("ended", self._status_due_s)
+        self._status("ended", self._status_due_s)
 
     def _status(self, state: str, passed_s: float) -> None:
         if self._publisher is not None:
@@ -316,16 +314,15 @@ class Summary:
         """Return the summary of the replay as a JSON document; non-finite values are None."""
         estimate = self._last.tick.estimate if self._last is not None else None
         names = ("stiffness_nm_rad", "stiffness_std_nm_rad", "flexibility_torque_nm")
-        end = finite({name: getattr(estimate, name, None) for name in names})
-        seconds = self._last.time_s - self._first_s if self._last is not None else 0.0
-        counts = {
+        return {
+            "seconds": round(self._last.time_s - self._first_s, 6) if self._last is not None else 0.0,
             "cycles": self.count,
             "samples_missing": self._missing()[0],
             "valid": self.valid,
             "observable": self.observable,
+            "not_valid": [{"reason": text, "cycles": count} for count, text in self._sorted()],
+            "end": finite({name: getattr(estimate, name, None) for name in names}),
         }
-        why = [{"reason": text, "cycles": count} for count, text in self._sorted()]
-        return {"seconds": round(seconds, 6), **counts, "not_valid": why, "end": end}
 
     def plot(self, folder: Path, title: str) -> list[Path]:
         """Write stiffness over deflection, and torque and stiffness over time."""

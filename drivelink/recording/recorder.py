@@ -214,10 +214,9 @@ class BusTap:
         return most <= 0
 
     def _reopen(self) -> None:
-        now_s = time.monotonic()
-        if now_s < self._reopen_s:
+        if time.monotonic() < self._reopen_s:
             return
-        self._reopen_s = now_s + _REOPEN_S
+        self._reopen_s = time.monotonic() + _REOPEN_S
         self.close()
         with suppress(BusError):
             self._bus = open_bus(self._section)

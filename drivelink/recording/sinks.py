@@ -79,11 +79,11 @@ class SafeFile(io.BufferedIOBase):
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
         """Write bytes; at the end of the file they are buffered until `flush`."""
-        if self._place is not None:
+        if self._place is None:
+            self._pending += data
+        else:
             self._put(bytes(data), self._place)
             self._place += len(data)
-            return len(data)
-        self._pending += data
         return len(data)
 
     def flush(self) -> None:
@@ -133,11 +133,8 @@ class SafeFile(io.BufferedIOBase):
             raise self._failed(error) from error
 
     def _failed(self, error: OSError) -> RecordingError:
-        kept = (
-            "it holds everything up to the last second"
-            if self._size and self._file.placed
-            else "nothing was written"
-        )
+        whole = self._size and self._file.placed
+        kept = "it holds everything up to the last second" if whole else "nothing was written"
         return RecordingError(f"{self._path}: cannot be written any further: {error.strerror}; {kept}")
 
 
@@ -265,15 +262,12 @@ class McapSink(MessageSink):
             index_types=IndexType.CHUNK | IndexType.METADATA,
         )
         self._writer.start(library=f"drivelink/{__version__}")
-        self._writer.add_metadata(
-            "drivelink",
-            {"joint": joint.name, "motors": str(motors), "period_s": repr(period_s), "version": __version__},
-        )
+        about = {"joint": joint.name, "motors": str(motors), "period_s": repr(period_s)}
+        self._writer.add_metadata("drivelink", about | {"version": __version__})
         self._channels = {}
         for topic in TOPICS:
-            schema = self._writer.register_schema(
-                SCHEMA_NAMES.get(topic, f"drivelink.{topic}"), "jsonschema", message_schema(topic, motors)
-            )
+            name = SCHEMA_NAMES.get(topic, f"drivelink.{topic}")
+            schema = self._writer.register_schema(name, "jsonschema", message_schema(topic, motors))
             self._channels[topic] = self._writer.register_channel(f"/{joint.name}/{topic}", "json", schema)
         self._joint = json.dumps({"text": joint_text}).encode() if joint_text else b""
 

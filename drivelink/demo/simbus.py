@@ -236,13 +236,8 @@ def _message(words: list[str], stamp_s: float) -> can.Message:
     identifier, length, *data = words
     if len(data) != int(length) or len(data) > 8:
         raise ValueError("length")
-    return can.Message(
-        timestamp=stamp_s,
-        arbitration_id=int(identifier, 16),
-        is_extended_id=len(identifier) > 3,
-        data=bytes(int(byte, 16) for byte in data),
-        check=True,
-    )
+    content, extended = bytes(int(byte, 16) for byte in data), len(identifier) > 3
+    return can.Message(stamp_s, int(identifier, 16), extended, data=content, check=True)
 
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
@@ -312,10 +307,6 @@ def require_free(bus: can.BusABC, node_ids: Sequence[int], section: BusSection) 
     if section.interface == "virtual" or isinstance(bus, SocketcandServer):
         return  # no other process can be there
     there, _ = scan(bus, node_ids)
-    taken = sorted(set(node_ids).intersection(there))
-    if taken:
-        nodes = ", ".join(f"node {node}" for node in taken)
-        raise BusError(
-            f"{section.interface} {section.channel}: {nodes}: on the bus already: another `drivelink sim`, "
-            "or real drives; end it, or use another --channel"
-        )
+    if nodes := ", ".join(f"node {node}" for node in sorted(set(node_ids).intersection(there))):
+        said = "on the bus already: another `drivelink sim`, or real drives; end it, or use another --channel"
+        raise BusError(f"{section.interface} {section.channel}: {nodes}: {said}")

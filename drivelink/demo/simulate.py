@@ -104,10 +104,8 @@ def assumptions(joint: JointFile) -> list[str]:
         transmission = motor.transmission
         if transmission.model != "none" and not transmission.parameters and transmission.model in _ASSUMED:
             k = _assumed_stiffness(motor)
-            lines.append(
-                f"motor[{index}].transmission has no parameters: simulated with {k:.3g} N·m/rad at rest, "
-                f"{_NATURAL_HZ:g} Hz with the motor's inertia"
-            )
+            text = f"motor[{index}].transmission has no parameters: simulated with {k:.3g} N·m/rad at rest"
+            lines.append(f"{text}, {_NATURAL_HZ:g} Hz with the motor's inertia")
     if joint.link.dynamics is None and not _one_body(joint):
         lines.append("no [link.dynamics]: simulated with twice the first motor's inertia at the link")
     return lines
@@ -127,9 +125,8 @@ def _spring(motor: MotorSection, index: int) -> Spring:
     if transmission.model == "none" or transmission.parameters:
         return Spring(model=transmission.model, parameters=transmission.parameters)
     if transmission.model not in _ASSUMED:
-        raise SimError(
-            f"motor[{index}].transmission.parameters: expected them, no spring is assumed for this model"
-        )
+        text = "expected them, no spring is assumed for this model"
+        raise SimError(f"motor[{index}].transmission.parameters: {text}")
     k, order = _assumed_stiffness(motor), transmission.order or 2
     return Spring(model=transmission.model, parameters=_ASSUMED[transmission.model](k, order))
 
@@ -261,9 +258,8 @@ def nodes_from_joint(
     nodes: list[Node] = []
     for index, motor in enumerate(joint.motor):
         if motor.drive is None:
-            raise JointFileError(
-                f"{file or joint.name}: motor[{index + 1}].drive: expected this table to simulate it"
-            )
+            text = "expected this table to simulate it"
+            raise JointFileError(f"{file or joint.name}: motor[{index + 1}].drive: {text}")
         number = motor.drive.node_id
         nodes.append(Cia402Drive(number, world, index, own, link_encoder=number == host))
     if encoder is not None and encoder.source == "cia406" and encoder.node_id is not None:

@@ -53,16 +53,14 @@ class Comparison:
 
     def received(self, estimate: EstimateMessage) -> None:
         """Enter a received estimate."""
-        truth = self._truth.pop(estimate.sequence, None)
-        if truth is not None:
+        if (truth := self._truth.pop(estimate.sequence, None)) is not None:
             self._pair(estimate, truth)
         else:
             _keep(self._estimates, estimate.sequence, estimate)
 
     def known(self, truth: TruePoint) -> None:
         """Enter the truth at one SYNC."""
-        estimate = self._estimates.pop(truth.sequence, None)
-        if estimate is not None:
+        if (estimate := self._estimates.pop(truth.sequence, None)) is not None:
             self._pair(estimate, truth)
         else:
             _keep(self._truth, truth.sequence, truth)
@@ -72,12 +70,9 @@ class Comparison:
         if self._cycles == 0:
             return RmsErrors(0, math.nan, math.nan, math.nan)
         stiffness, true_stiffness, torque, true_torque = self._sums
-        return RmsErrors(
-            self._cycles,
-            math.sqrt(stiffness / true_stiffness) if true_stiffness else math.nan,
-            math.sqrt(torque / true_torque) if true_torque else math.nan,
-            self._covered / self._cycles,
-        )
+        of_stiffness = math.sqrt(stiffness / true_stiffness) if true_stiffness else math.nan
+        of_torque = math.sqrt(torque / true_torque) if true_torque else math.nan
+        return RmsErrors(self._cycles, of_stiffness, of_torque, self._covered / self._cycles)
 
     def _pair(self, estimate: EstimateMessage, truth: TruePoint) -> None:
         self.latest = estimate, truth
@@ -263,8 +258,7 @@ class DemoRun:
                 break
             self.received += 1
             self.comparison.received(estimate)
-        status = subscription.status
-        if status:
+        if status := subscription.status:
             self._view.status = status
         if self.comparison.latest is not None:
             last, truth = self.comparison.latest
@@ -274,7 +268,6 @@ class DemoRun:
             self._next_line_s = time.monotonic() + (_FRAME_S if self._live else _LINE_S)
             if self._screen is not None:
                 self._screen.refresh()
-            else:
-                if (line := self._view.line()) != self._said:
-                    sys.stderr.write(f"{stamped(line, sys.stderr)}\n")
+            elif (line := self._view.line()) != self._said:
+                sys.stderr.write(f"{stamped(line, sys.stderr)}\n")
                 self._said = line

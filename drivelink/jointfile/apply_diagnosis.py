@@ -34,10 +34,8 @@ _LOG = logging.getLogger(__name__)
 def _baseline(
     records: Record | Sequence[Record], model: JointModel, surplus: float
 ) -> ResidualBaseline | None:
-    if not can_monitor(model):
-        return None
     try:
-        return measure_baseline(records, model, surplus)
+        return measure_baseline(records, model, surplus) if can_monitor(model) else None
     except EstimatorError as error:
         _LOG.warning("no residual baseline is written, so the daemon cannot raise the model alarm: %s", error)
         return None
@@ -142,9 +140,8 @@ def _readings(outcome: Diagnosis, motor: int | None) -> list[Effect]:
     """Skew and offsets between the channels, which also exist on the bus."""
     if outcome.verdict == "insufficient_excitation":
         return []
-    if motor is None:
-        places = {"link_position_delay_s": ("encoder_delay", "delay_s")}
-    else:
+    places = {"link_position_delay_s": ("encoder_delay", "delay_s")}
+    if motor is not None:
         places = {
             f"motor{motor + 1}_torque_delay_s": ("torque_delay", "delay_s"),
             f"motor{motor + 1}_torque_offset_nm": ("torque_offset", "torque_nm"),

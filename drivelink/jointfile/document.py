@@ -310,8 +310,7 @@ def _inline(value: Any) -> Any:
     """Return a value without header."""
     if isinstance(value, dict):
         made = tomlkit.inline_table()
-        for key, one in value.items():
-            made[key] = _inline(one)
+        made.update({key: _inline(one) for key, one in value.items()})
         return made
     if isinstance(value, list):
         array = tomlkit.array()
@@ -346,7 +345,5 @@ def _shown(value: Any) -> str:
 
 
 def _key(location: tuple[int | str, ...]) -> str:
-    text = ""
-    for part in location:
-        text += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
-    return text.lstrip(".")
+    parts = (f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in location)
+    return "".join(parts).lstrip(".")

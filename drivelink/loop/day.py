@@ -67,10 +67,8 @@ class Day:
         if message is None:
             return
         valid, self._valid, self._all = self._valid / self._all, 0, 0
-        values = (
-            self._clock(), message.stiffness_nm_rad, message.stiffness_std_nm_rad, valid, *self._friction
-        )  # fmt: skip
-        line = f"{values[0]:.3f}," + ",".join(f"{value:.6g}" for value in values[1:]) + "\n"
+        values = message.stiffness_nm_rad, message.stiffness_std_nm_rad, valid, *self._friction
+        line = f"{self._clock():.3f}," + ",".join(f"{value:.6g}" for value in values) + "\n"
         try:
             self._append(line)
             self._failed = False

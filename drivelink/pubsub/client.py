@@ -94,13 +94,9 @@ class Subscription(Client):
         return sample
 
     def _wake(self) -> None:
+        here = zenoh.Locality.SESSION_LOCAL
         with suppress(zenoh.ZError):
-            self._session.put(
-                self.key + "/estimate",
-                b"",
-                attachment=WAKE,
-                allowed_destination=zenoh.Locality.SESSION_LOCAL,
-            )
+            self._session.put(self.key + "/estimate", b"", attachment=WAKE, allowed_destination=here)
 
     def _wait(
         self, timeout_s: float | None, pick: Callable[[], EstimateMessage | None]
@@ -115,8 +111,7 @@ class Subscription(Client):
             self._alarm.set(min(deadline_s, self._hint_s))
             try:
                 sample = self._queue.recv()
-                now_ns = time.monotonic_ns()
-                self._admit(sample, now_ns)
+                self._admit(sample, time.monotonic_ns())
             except zenoh.ZError:  # closed meanwhile by another thread
                 return None
             finally:

@@ -117,9 +117,7 @@ def waiting(subscriber: Any, most: int) -> Iterator[zenoh.Sample]:
     return islice(iter(subscriber.try_recv, None), most)
 
 
-MAX_CLAIMS = (
-    4096  # limit on tokens of one joint; beyond it tokens are ignored, so that a flood locks nobody out
-)
+MAX_CLAIMS = 4096  # tokens of one joint; further ones are ignored, so that a flood locks nobody out
 _ZID = re.compile(r"[0-9a-f]{1,32}")
 
 
@@ -242,11 +240,10 @@ class Arrivals:
     def came(self, stamp_ns: int, now_ns: int) -> None:
         """Note an estimate with this stamp read from the queue now."""
         difference = now_ns - stamp_ns
-        if self._offset_ns is None:
-            self._offset_ns = difference
-        else:
+        if self._offset_ns is not None:
             drift = int((now_ns - self._read_ns) * _DRIFT)
-            self._offset_ns = min(self._offset_ns + drift, difference)
+            difference = min(self._offset_ns + drift, difference)
+        self._offset_ns = difference
         self._read_ns = now_ns
         self._arrival_ns = min(max(stamp_ns + self._offset_ns, self._empty_ns), now_ns)
 
@@ -307,12 +304,8 @@ class Feed:
 
     def _count(self, message: EstimateMessage, overrun: bool) -> None:
         before = self.latest
-        if before is None:
-            return
-        step = message.sequence - before.sequence
-        if step == 1 and self._period_ns:
-            return
-        if step < 1:  # the daemon restarted
+        step = 0 if before is None else message.sequence - before.sequence
+        if before is None or step < 1 or (step == 1 and self._period_ns):  # below 1: the daemon restarted
             return
         if overrun:
             self.skipped += step - 1

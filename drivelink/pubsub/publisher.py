@@ -138,8 +138,7 @@ class JointPublisher:
         """Answer one waiting query of each key; called in the slack, some twenty times a second."""
         for name, queryable in self._questions:
             with suppress(zenoh.ZError):
-                query = queryable.try_recv()
-                if query is not None:
+                if (query := queryable.try_recv()) is not None:
                     with query:
                         query.reply(f"{self.key}/{name}", self._documents[name], encoding=_JSON, express=True)
 
@@ -249,14 +248,12 @@ def describe_model(joint: JointFile, layouts: Sequence[NodeLayout] = ()) -> dict
 
 
 def _describe_motor(motor: MotorSection) -> dict[str, Any]:
+    own = motor.transmission
+    parameters = plain_parameters(own.parameters)
     return {
         "inertia_kg_m2": motor.inertia_kg_m2,
         "viscous_damping_nm_s_rad": motor.viscous_damping_nm_s_rad,
-        "transmission": {
-            "model": motor.transmission.model,
-            "order": motor.transmission.order,
-            "parameters": plain_parameters(motor.transmission.parameters),
-        },
+        "transmission": {"model": own.model, "order": own.order, "parameters": parameters},
         "effects": [effect_entry(effect) for effect in motor.effect],
     }
 

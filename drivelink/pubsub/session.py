@@ -20,6 +20,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,13 +64,11 @@ _CONNECT_S = 0.5
 def answers(endpoint: str) -> bool:
     """Return whether anything accepts a TCP connection at the endpoint."""
     address = _address(endpoint)
-    if address is None:
-        return False
-    try:
-        with socket.create_connection(address, timeout=_CONNECT_S):
+    with suppress(OSError):
+        if address is not None:
+            socket.create_connection(address, timeout=_CONNECT_S).close()
             return True
-    except OSError:
-        return False
+    return False
 
 
 def _address(endpoint: str) -> tuple[str, int] | None:
@@ -203,10 +202,8 @@ def open_session(section: ZenohSection, base_dir: Path) -> zenoh.Session:
         return _open(_read(base_dir / section.config))
     endpoint = _require_endpoint(section.endpoint)
     if not answers(endpoint):
-        try:
+        with suppress(zenoh.ZError):  # not an address of this machine, or another daemon was quicker
             return _keep(zenoh.open(daemon_config(endpoint, listen=True)))
-        except zenoh.ZError:  # not an address of this machine, or another daemon was quicker
-            pass
     return _join(endpoint)
 
 
@@ -241,10 +238,8 @@ def _join(endpoint: str) -> zenoh.Session:
     session = _open(daemon_config(endpoint, listen=False), Rendezvous(endpoint))
     if not connected(session) and answers(endpoint):
         close_session(session)
-        raise ZenohError(
-            f"{endpoint}: another program listens there and does not speak zenoh: "
-            f"end it, or set zenoh.endpoint in the joint file"
-        )
+        fix = "end it, or set zenoh.endpoint in the joint file"
+        raise ZenohError(f"{endpoint}: another program listens there and does not speak zenoh: {fix}")
     return session
 
 

@@ -181,9 +181,7 @@ def _usable(message: EstimateMessage) -> bool:
     """Return whether all numbers are possible: finite, stiffness and standard deviation not negative."""
     _, _, status, torque, stiffness, std, transmissions = message
     partial = bool(status & _PARTIAL)
-    if not (math.isfinite(torque) and _magnitude(stiffness, partial) and _magnitude(std, partial)):
-        return False
-    for own_torque, own_stiffness, own_std, deflection in transmissions:
+    for own_torque, own_stiffness, own_std, deflection in ((torque, stiffness, std, 0.0), *transmissions):
         if not (
             math.isfinite(own_torque)
             and _magnitude(own_stiffness, partial)
@@ -243,6 +241,5 @@ def _count(payload: bytes, counts: Mapping[int, int], layout: Layout) -> int:
 
 def _require_count(stated: int, count: int, layout: Layout) -> None:
     if stated != count:
-        raise ZenohError(
-            f"{layout.schema}: expected {count} {layout.elements} by its length, it says {stated}"
-        )
+        says = f"expected {count} {layout.elements} by its length, it says {stated}"
+        raise ZenohError(f"{layout.schema}: {says}")

@@ -83,9 +83,7 @@ def report_checks(
         name: {signal: unused(wanted, available.get(signal, ())) for signal in signals}
         for name, signals in (_SIGNALS | {"second_encoder": (Signal.SECOND_POSITION,)}).items()
     }
-    found = {
-        name: objects for name, objects in offered.items() if name not in mapped and all(objects.values())
-    }
+    found = {name: each for name, each in offered.items() if name not in mapped and all(each.values())}
     encoder = found.pop("second_encoder", None)
 
     def report(text: str, objects: Available, line: str) -> None:
@@ -99,9 +97,8 @@ def report_checks(
     for name, objects in found.items():
         report(f"{name} ({_names(objects)}) can be compared with {_AGAINST[name]}", objects, checks([name]))
     if len(found) > 1:
-        report(
-            "all of them", {signal: o for each in found.values() for signal, o in each.items()}, checks(found)
-        )
+        every = {signal: objects for each in found.values() for signal, objects in each.items()}
+        report("all of them", every, checks(found))
     if encoder is not None and drive.second_encoder is None:
         name = _names(encoder)
         text = f"second encoder ({name}), if on the motor, can be compared with position"
@@ -153,9 +150,7 @@ def examine_sheet(section: Section, path: Path) -> None:
     section.info("by default", describe(tpdo for tpdo in tpdos if tpdo.enabled))
     role = _role(sheet)
     optional = (Signal.MOTOR_VELOCITY, *CHECKS)  # not mapped by default
-    mappable = {
-        signal: objects for signal, objects in available.items() if objects and signal not in optional
-    }
+    mappable = {signal: found for signal, found in available.items() if found and signal not in optional}
     if any(not available[signal] for signal in _needed(sheet) & available.keys()):
         return
     _units(section, sheet)
@@ -186,9 +181,8 @@ def _title(sheet: DataSheet) -> str:
 
 
 def _is_encoder(sheet: DataSheet) -> bool:
-    return (sheet.value(0x1000) or 0) & 0xFFFF == 406 or (
-        (0x6004, 0) in sheet.objects and (0x6064, 0) not in sheet.objects
-    )
+    counts = (0x6004, 0) in sheet.objects and (0x6064, 0) not in sheet.objects
+    return counts or (sheet.value(0x1000) or 0) & 0xFFFF == 406
 
 
 def _needed(sheet: DataSheet) -> set[Signal]:
@@ -264,10 +258,8 @@ def _units(section: Section, sheet: DataSheet) -> None:
     """Units in the file, and those that the joint file has to declare."""
     if _is_encoder(sheet):
         counts = sheet.value(0x6501)
-        text = (
-            f"0x6501 says {counts} counts per revolution" if counts else "state link.encoder.counts_per_rev"
-        )
-        section.info("units", text)
+        said = f"0x6501 says {counts} counts per revolution"
+        section.info("units", said if counts else "state link.encoder.counts_per_rev")
         return
     drive = DriveSection(node_id=1)
     bare = Role(node_id=1, motor=0, drive=drive, encoder=None, key="motor.drive", eds=sheet.path, tpdo=())

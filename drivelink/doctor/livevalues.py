@@ -148,9 +148,8 @@ class Heard:
         """Return what was heard since the last call, of the channels that have every value."""
         self._keep(self._frames.rest())
         samples, self._samples = self._samples, []
-        motors = range(len(samples[0].motor_position_rad) if samples else 0)
         values: dict[Channel, list[float]] = {}
-        for i in motors:
+        for i in range(len(samples[0].motor_position_rad) if samples else 0):
             values[Signal.MOTOR_POSITION, i] = [sample.motor_position_rad[i] for sample in samples]
             values[Signal.MOTOR_TORQUE, i] = [sample.motor_torque_nm[i] for sample in samples]
         values[Signal.LINK_POSITION, None] = [sample.link_position_rad for sample in samples]
@@ -249,12 +248,8 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[Reader]:
     with open_bus(joint.bus) as bus:
         if joint.bus.configure:
             mine = roles(joint, base_dir)
-            asked = Asked(
-                [
-                    run_program(survey_node(role), bus, joint.bus, end_s=end_s)
-                    for role, end_s in zip(mine, shares(len(mine)), strict=True)
-                ]
-            )
+            ends = zip(mine, shares(len(mine)), strict=True)
+            asked = Asked([run_program(survey_node(one), bus, joint.bus, end_s=end_s) for one, end_s in ends])
             yield lambda seconds: values_of(run_program(asked.program(seconds), bus, joint.bus))
         else:
             silent = SilentBus(bus)

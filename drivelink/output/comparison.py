@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drivelink.output import plots
-from drivelink.output.document import Chart, Document, Grid, Paragraph, Rows, Section, as_text
+from drivelink.output.document import Block, Chart, Document, Grid, Paragraph, Rows, Section, as_text
 from drivelink.output.numbers import Units, number, value_and_interval
 from estimator.comparison import Correlation, Curve, correlations, friction_curve, stiffness_curve
 from estimator.errors import EstimatorError
@@ -108,9 +108,7 @@ class Comparison:
             {
                 "recording": side.name,
                 "horizon_s": [run.horizon_s for run in runs],
-                "fit_percent": {
-                    letter: dict(run.fit_percent) for letter, run in zip("ab", runs, strict=True)
-                },
+                "fit_percent": dict(zip("ab", (dict(run.fit_percent) for run in runs), strict=True)),
                 "coasting_percent": dict(runs[0].coasting_percent),
             }
             for side, *runs in self.runs
@@ -131,17 +129,13 @@ class Comparison:
         sections = [Section("Where the curves differ most", [self._differences()])]
         for side, *runs in self.runs:
             sections.append(fits(dict(zip("AB", runs, strict=True)), side.name))
-            charts: list[Any] = [
-                Chart(partial(self._over, side, runs), "measured and simulated"),
-                Chart(
-                    partial(self._correlated, side, runs), "residual of that channel; bands: 95 % of chance"
-                ),
-            ]
-            sections.append(Section(f"Over {side.name}", charts))
+            over = Chart(partial(self._over, side, runs), "measured and simulated")
+            text = "residual of that channel; bands: 95 % of chance"
+            left = Chart(partial(self._correlated, side, runs), text)
+            sections.append(Section(f"Over {side.name}", [over, left]))
         for motor in range(len(self.sides[0].model.motors)):
-            charts = [
-                Chart(partial(self._curve, motor, kind)) for kind, of in self.curves(motor).items() if of
-            ]
+            kinds = [kind for kind, curves in self.curves(motor).items() if curves]
+            charts: list[Block] = [Chart(partial(self._curve, motor, kind)) for kind in kinds]
             sections.append(Section(f"Motor {motor + 1}", charts))
         return sections
 
@@ -179,13 +173,9 @@ class Comparison:
 
     def _correlated(self, side: Side, runs: Sequence[FreeRun]) -> Figure:
         figure, all_axes = plots.new_figure(rows=2, width=_WIDTH, height=2.0)
-        both = [self.residuals(side, run) for run in runs]
-        for axes, title, ones in zip(
-            all_axes,
-            ("residual with itself", "residual with motor torque"),
-            zip(*both, strict=True),
-            strict=True,
-        ):
+        both = zip(*(self.residuals(side, run) for run in runs), strict=True)
+        titles = "residual with itself", "residual with motor torque"
+        for axes, title, ones in zip(all_axes, titles, both, strict=True):
             curves = {a: plots.PlotCurve(one.lag_s, one.value) for a, one in zip("AB", ones, strict=True)}
             plots.xy(axes, curves, "lag / s", "correlation", title)
             band = max(one.band for one in ones)

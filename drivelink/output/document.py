@@ -192,8 +192,7 @@ def page(document: Document) -> str:
 
 def _section(section: Section) -> str:
     heading = f"<h2>{_escaped(section.title)}</h2>" if section.title else ""
-    kind = "wide" if section.wide else "half"
-    return f'<section class="{kind}">{heading}{drawn(section.blocks)}</section>'
+    return f'<section class="{"wide" if section.wide else "half"}">{heading}{drawn(section.blocks)}</section>'
 
 
 def drawn(blocks: Iterable[Block]) -> str:
@@ -218,7 +217,7 @@ def drawn(blocks: Iterable[Block]) -> str:
 
 
 def _table(grid: Grid) -> str:
-    rows = "".join(map(_row, grid.rows, [len(grid.head)] * len(grid.rows)))
+    rows = "".join(_row(cells, len(grid.head)) for cells in grid.rows)
     head = "".join(f"<th>{_escaped(cell)}</th>" for cell in grid.head)
     return f'<div class="table"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
 
@@ -227,10 +226,9 @@ def _row(cells: tuple[Cell, ...], columns: int) -> str:
     if len(cells) == 1:
         return f'<tr class="over"><th colspan="{columns}">{_escaped(cell_text(cells[0]))}</th></tr>'
     first, *rest = cells
-    drawn = "".join(map(_cell, rest))
     kind = ' class="chosen"' if cell_text(first).startswith("▶") else ""
     name = _escaped(cell_text(first)).replace("_", "_<wbr>")
-    return f"<tr{kind}><th>{name}</th>{drawn}</tr>"
+    return f"<tr{kind}><th>{name}</th>{''.join(map(_cell, rest))}</tr>"
 
 
 def _cell(cell: Cell) -> str:

@@ -87,10 +87,7 @@ def as_json(outcome: Diagnosis, runs: Mapping[str, FreeRun], of: str) -> dict[st
         "error": {"train": outcome.train._asdict(), "validation": outcome.validation._asdict()},
         "transmissions": [asdict(one) for one in outcome.transmissions],
         "recordings": [
-            {
-                "train": one.train._asdict(),
-                "validation": None if one.validation is None else one.validation._asdict(),
-            }
+            {"train": one.train._asdict(), "validation": one.validation and one.validation._asdict()}
             for one in outcome.recordings
         ],
         "alignment": dict(outcome.alignment),
@@ -106,7 +103,7 @@ def _effect(finding: Finding, unlisted: Curve | None) -> dict[str, Any]:
     entry = _numbered(asdict(finding))
     if not finding.coordinates:
         del entry["coordinates"]
-    if finding.coordinates and unlisted is not None:
+    elif unlisted is not None:
         entry["curve"] = _points(unlisted)
     return entry
 
@@ -129,14 +126,10 @@ def _points(curve: Curve) -> dict[str, list[float]]:
 
 def html_page(outcome: Diagnosis, title: Title, more: Sequence[Section] = ()) -> str:
     """Draw the report as one self-contained page; `more` follows what was found."""
-    about = (
-        f"Diagnosis of {title.recording}, validated on "
-        f"{title.validation or 'held-out blocks of the same recording'}; "
-        f"all channels filtered alike at {outcome.bandwidth_hz:.3g} Hz."
-    )
-    return page(
-        Document(f"{title.joint}: diagnosis", about, [*sections(outcome, Units(title.linear)), *more])
-    )
+    on, band = title.validation or "held-out blocks of the same recording", f"{outcome.bandwidth_hz:.3g} Hz"
+    about = f"Diagnosis of {title.recording}, validated on {on}; all channels filtered alike at {band}."
+    made = [*sections(outcome, Units(title.linear)), *more]
+    return page(Document(f"{title.joint}: diagnosis", about, made))
 
 
 def sections(outcome: Diagnosis, units: Units) -> list[Section]:
@@ -215,10 +208,8 @@ def _candidates(outcome: Diagnosis) -> list[Block]:
         left = Share(percent(rival.error_relative, 2), rival.error_relative / most)
         rows.append((named, *chance, left))
     head = ("candidate", *(("probability",) if found else ()), "error left with it alone")
-    return [
-        Grid(head, _together(rows)),
-        Paragraph(_choice_of(outcome, [r.error_relative for r in shown if (r.name, r.motor) in found])),
-    ]
+    chosen = [rival.error_relative for rival in shown if (rival.name, rival.motor) in found]
+    return [Grid(head, _together(rows)), Paragraph(_choice_of(outcome, chosen))]
 
 
 def _together(rows: Rows) -> Rows:
@@ -319,9 +310,8 @@ def residual_figure(outcome: Diagnosis, units: Units) -> Figure:
 def _series_figure(outcome: Diagnosis, units: Units, names: Mapping[str, str], title: str) -> Figure:
     figure, (axes,) = plots.new_figure(width=_COLUMN, height=2.6)
     if (series := outcome.series) is not None:
-        curves = {
-            label: plots.PlotCurve(series.time_s, getattr(series, name)) for label, name in names.items()
-        }
+        named = {label: getattr(series, name) for label, name in names.items()}
+        curves = {label: plots.PlotCurve(series.time_s, values) for label, values in named.items()}
         plots.over_time(axes, curves, units.label("torque / N·m"), title)
     return figure
 

@@ -82,10 +82,8 @@ def _parameters(outcome: Diagnosis, joint: JointFile, units: Units) -> list[str]
         where = f"motor {number}" if len(joint.motor) > 1 else "transmission"
         for name, value in one.parameters.items():
             declared = motor.transmission.parameters.get(name)
-            line = f"{where}: {name} = {units.value(name, value, one.std.get(name))}"
-            lines.append(
-                line + (f", was {units.value(name, declared, None)}" if declared is not None else "")
-            )
+            was = "" if declared is None else f", was {units.value(name, declared, None)}"
+            lines.append(f"{where}: {name} = {units.value(name, value, one.std.get(name))}{was}")
     return lines
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from drivelink.output.numbers import Units, bare_name
 from drivelink.pubsub.wire import EXTERNAL_COLUMNS, EstimateMessage, ExternalMessage
 from drivelink.recording.columns import sample_columns, sample_row
-from estimator.sample import SIGMA_95, External, ExternalStatus, Sample, Status, TransmissionEstimate
+from estimator.sample import SIGMA_95, Estimate, External, ExternalStatus, Sample, Status
 
 TOPICS = ("sample", "estimate", "external", "status", "model", "joint", "mapping", "can", "log")
 SCHEMA_NAMES = {"log": "foxglove.Log"}  # others are drivelink.<topic>
@@ -27,23 +27,13 @@ _JSON = ("false", "true")
 
 def estimate_columns(motors: int) -> tuple[str, ...]:
     """Return the names of an estimate's values, in the order of `estimate_row`."""
-    return (
-        "time_s",
-        "flexibility_torque_nm",
-        "stiffness_nm_rad",
-        "stiffness_std_nm_rad",
-        "observable",
-        *(f"motor{i}_{name}" for i in range(1, motors + 1) for name in _PER_MOTOR),
-    )
+    each = (f"motor{i}_{name}" for i in range(1, motors + 1) for name in _PER_MOTOR)
+    return ("time_s", *_PER_MOTOR[:3], "observable", *each)
 
 
-def estimate_row(
-    time_s: float,
-    status: int,
-    totals: tuple[float, float, float],
-    transmissions: tuple[TransmissionEstimate, ...],
-) -> tuple[float, ...]:
+def estimate_row(time_s: float, estimate: Estimate) -> tuple[float, ...]:
     """Return an estimate as the values of `estimate_columns`."""
+    _, status, *totals, transmissions = estimate
     observable = 1 if status & _OBSERVABLE else 0
     return (time_s, *totals, observable, *(value for one in transmissions for value in one))
 

@@ -148,8 +148,7 @@ def _columns(motors: int) -> tuple[str, ...]:
 def _row(played: Played, estimator: Estimator) -> tuple[float, ...]:
     """Return a cycle, the last of the estimator, as the values of `_columns`."""
     estimate = played.tick.estimate
-    totals = (estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad)
-    row = estimate_row(round(played.time_s, 9), estimate.status, totals, estimate.transmissions)
+    row = estimate_row(round(played.time_s, 9), estimate)
     torque_valid, std = int(bool(estimate.status & _TORQUE_VALID)), estimator.flexibility_torque_std_nm
     return (*row, estimate.status & _VALID, estimate.status, torque_valid, std)
 

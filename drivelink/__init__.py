@@ -31,21 +31,15 @@ if TYPE_CHECKING:
     from drivelink.pubsub.clientbase import joints as joints
     from drivelink.pubsub.feed import State as State
 
-_LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
-    "AsyncSubscription": "drivelink.pubsub.client",
-    "Comparison": "drivelink.output.comparison",
-    "Diagnosed": "drivelink.analysis",
-    "Fit": "drivelink.analysis",
-    "Picture": "drivelink.analysis",
-    "State": "drivelink.pubsub.feed",
-    "Subscription": "drivelink.pubsub.client",
-    "compare": "drivelink.comparison",
-    "diagnose": "drivelink.analysis",
-    "fit": "drivelink.analysis",
-    "joints": "drivelink.pubsub.clientbase",
-    "subscribe": "drivelink.pubsub.client",
-    "subscribe_async": "drivelink.pubsub.client",
+_MODULES = {  # imported when asked for, so that `import drivelink` stays cheap
+    "analysis": ("Diagnosed", "Fit", "Picture", "diagnose", "fit"),
+    "comparison": ("compare",),
+    "output.comparison": ("Comparison",),
+    "pubsub.client": ("AsyncSubscription", "Subscription", "subscribe", "subscribe_async"),
+    "pubsub.clientbase": ("joints",),
+    "pubsub.feed": ("State",),
 }
+_LAZY = {name: f"drivelink.{module}" for module, names in _MODULES.items() for name in names}
 
 __all__ = ["__version__", *_LAZY]
 

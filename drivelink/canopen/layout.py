@@ -109,16 +109,19 @@ def object_address(text: str, key: str) -> tuple[int, int]:
 
 
 class Signal(StrEnum):
-    """Meaning of a mapped object for the joint."""
+    """Meaning of a mapped object for the joint, the most important first.
+
+    Position and torque are at the beginning: they must belong to the same instant.
+    """
 
     MOTOR_POSITION = "motor_position"
-    MOTOR_VELOCITY = "motor_velocity"
     MOTOR_TORQUE = "motor_torque"
     STATUSWORD = "statusword"
     LINK_POSITION = "link_position"
     LINK_VELOCITY = "link_velocity"
-    VELOCITY_CHECK = "velocity_check"  # the motor's, for cross-checks only; so are the following
-    TORQUE_CHECK = "torque_check"  # current beside torque, or torque beside current
+    MOTOR_VELOCITY = "motor_velocity"
+    TORQUE_CHECK = "torque_check"  # current beside torque, or torque beside current; for cross-checks only
+    VELOCITY_CHECK = "velocity_check"  # the motor's; so are the following
     SECOND_POSITION = "second_position"  # the motor's, by another encoder
     FOLLOWING_ERROR = "following_error"
     POSITION_DEMAND = "position_demand"

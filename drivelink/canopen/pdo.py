@@ -225,20 +225,8 @@ def _layout(tpdo: Tpdo, chosen: dict[Address, MappedObject]) -> TpdoLayout:
     )
 
 
-# Position and torque first: they must belong to the same instant.
-_ORDER = (
-    Signal.MOTOR_POSITION,
-    Signal.MOTOR_TORQUE,
-    Signal.STATUSWORD,
-    Signal.LINK_POSITION,
-    Signal.MOTOR_VELOCITY,
-    Signal.TORQUE_CHECK,
-    Signal.VELOCITY_CHECK,
-    Signal.SECOND_POSITION,
-    Signal.FOLLOWING_ERROR,
-    Signal.POSITION_DEMAND,
-)
-CHECKS = _ORDER[5:]
+_ORDER = tuple(Signal)
+CHECKS = _ORDER[_ORDER.index(Signal.TORQUE_CHECK) : -1]
 OPTIONAL = (Signal.MOTOR_VELOCITY, Signal.STATUSWORD, *CHECKS)
 
 Available = Mapping[Signal, Sequence[MappedObject]]

@@ -12,14 +12,7 @@ from typing import TypeVar
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.bus import FrameBus, Idle, frames, is_canopen, listening_s, run_program, sender
-from drivelink.canopen.layout import (
-    COMFORTABLE,
-    BusLoad,
-    NodeLayout,
-    bus_load,
-    check_capacity,
-    roles_by_node,
-)
+from drivelink.canopen.layout import COMFORTABLE, BusLoad, NodeLayout, bus_load, check_capacity, roles_by_node
 from drivelink.canopen.mapping import NMT_START
 from drivelink.canopen.node import configure_node
 from drivelink.canopen.sdo import Program, SdoTimeout, Session

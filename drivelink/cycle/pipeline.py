@@ -33,11 +33,7 @@ def make_assembler(joint: JointFile, layouts: Sequence[NodeLayout]) -> Assembler
     """
     hold = max(_HOLD_PERIODS, round(_HOLD_S / joint.bus.period_s))
     assembler = Assembler(
-        layouts,
-        len(joint.motor),
-        active=joint.bus.configure,
-        hold_periods=hold,
-        period_s=joint.bus.period_s,
+        layouts, len(joint.motor), active=joint.bus.configure, hold_periods=hold, period_s=joint.bus.period_s
     )
     if joint.model().has_deflection and not assembler.has_link:
         raise DriveError(

@@ -21,17 +21,10 @@ OVERFLOW = "receive overflow"  # key of `FrameSource.errors`: frames lost becaus
 MOST_FRAMES = 256  # limit per call, so that a babbling node cannot block the loop
 
 
-_ERROR_KINDS = {  # linux/can/error.h, also used by python-can
-    0x001: "transmit timeout",
-    0x002: "arbitration lost",
-    0x004: "controller",
-    0x008: "protocol violation",
-    0x010: "transceiver",
-    0x020: "no acknowledgement",
-    0x040: "bus-off",
-    0x080: "bus error",
-    0x100: "restarted",
-}
+_ERROR_KINDS = (  # by bit: linux/can/error.h, also used by python-can
+    "transmit timeout", "arbitration lost", "controller", "protocol violation", "transceiver",
+    "no acknowledgement", "bus-off", "bus error", "restarted",
+)  # fmt: skip
 
 
 class CanFrame(NamedTuple):
@@ -82,7 +75,7 @@ class LostSource(FrameSource):
 
 def note_error(errors: dict[str, int], can_id: int, data: bytes) -> None:
     """Count an error frame by its kinds, which are bits of its identifier."""
-    kinds = [kind for bit, kind in _ERROR_KINDS.items() if can_id & bit] or ["other"]
+    kinds = [kind for bit, kind in enumerate(_ERROR_KINDS) if can_id >> bit & 1] or ["other"]
     if can_id & 0x004 and data[1:2] and data[1] & 0x01:
         kinds.append(OVERFLOW)
     for kind in kinds:

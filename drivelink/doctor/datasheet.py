@@ -8,15 +8,7 @@ from typing import Any
 
 from drivelink.canopen.eds import DataSheet, load_eds
 from drivelink.canopen.layout import MappedObject, Role, Signal
-from drivelink.canopen.pdo import (
-    CHECKS,
-    Available,
-    Tpdo,
-    assign,
-    describe,
-    entry_text,
-    unused,
-)
+from drivelink.canopen.pdo import CHECKS, Available, Tpdo, assign, describe, entry_text, unused
 from drivelink.canopen.units import offer
 from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.report import Section

@@ -15,13 +15,7 @@ from drivelink.version import __version__
 from estimator.effects import LIBRARY, sharpened
 from estimator.errors import EstimatorError
 from estimator.model import Effect, JointModel, Transmission
-from estimator.model_monitor import (
-    ModelMonitor,
-    ResidualBaseline,
-    can_monitor,
-    expecting,
-    measure_baseline,
-)
+from estimator.model_monitor import ModelMonitor, ResidualBaseline, can_monitor, expecting, measure_baseline
 from estimator.sample import Record
 
 if TYPE_CHECKING:

@@ -92,11 +92,7 @@ _QUIET_S = 60.0  # in which the same cause is not kept again
 _STATE_S = 12.0  # between two states of the estimator, at most
 _LATE_S = 1.0  # that a state may come after its sample
 _BLOCK = 20_000  # items between two syncs to disk
-_FLAGS = {
-    Status.MODEL_ALARM: "model alarm",
-    Status.CHANGED: "change",
-    Status.DRIVE_FAULT: "drive fault",
-}
+_FLAGS = {Status.MODEL_ALARM: "model alarm", Status.CHANGED: "change", Status.DRIVE_FAULT: "drive fault"}
 _MASK = sum(int(bit) for bit in _FLAGS)
 
 

@@ -233,11 +233,7 @@ def fits_json(runs: Mapping[str, FreeRun], of: str) -> dict[str, Any]:
 
 
 def beside(
-    name: str,
-    models: Sequence[JointModel],
-    runs: Mapping[str, FreeRun],
-    record: Record,
-    units: Units,
+    name: str, models: Sequence[JointModel], runs: Mapping[str, FreeRun], record: Record, units: Units
 ) -> list[Section]:
     """Return a report's sections: a model as declared (A) and as found (B) beside the machine.
 

@@ -27,14 +27,7 @@ from drivelink.output.document import (
     parameter_rows,
 )
 from drivelink.output.numbers import Units, among, number
-from drivelink.output.sentences import (
-    SURE,
-    free_curve,
-    others_of,
-    sentence,
-    title_of,
-    unexplained,
-)
+from drivelink.output.sentences import SURE, free_curve, others_of, sentence, title_of, unexplained
 from estimator.choices import choice
 from estimator.diagnosis import Curve, Diagnosis, Finding, StiffnessCurve
 from estimator.effects import LIBRARY, in_words

@@ -45,10 +45,7 @@ class Grid(NamedTuple):
 
 
 def find_grid(
-    time_s: FloatArray,
-    where: str,
-    nominal_s: float | None = None,
-    repeats: NDArray[np.bool_] | None = None,
+    time_s: FloatArray, where: str, nominal_s: float | None = None, repeats: NDArray[np.bool_] | None = None
 ) -> Grid:
     """Find the period (from the median step) and each row's number on the grid.
 

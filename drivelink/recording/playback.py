@@ -25,12 +25,7 @@ from drivelink.recording.columns import ColumnMap
 from drivelink.recording.cycles import Cycle, estimated
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, recorded_cycles, warn_of_another
-from drivelink.recording.messages import (
-    estimate_columns,
-    estimate_row,
-    external_columns,
-    external_row,
-)
+from drivelink.recording.messages import estimate_columns, estimate_row, external_columns, external_row
 from drivelink.recording.sinks import SafeFile
 from estimator.online import Estimator
 from estimator.reasons import percent, why_not_valid

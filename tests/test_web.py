@@ -12,8 +12,7 @@ import zenohkit
 
 from drivelink import cli
 from drivelink.monitor.watcher import Watcher
-from drivelink.monitor.web import MAX_STREAMS, WebView
-from drivelink.monitor.webserver import MAX_CONNECTIONS
+from drivelink.monitor.web import MAX_CONNECTIONS, MAX_STREAMS, WebView
 from drivelink.pubsub.session import close_session, open_client
 
 BLUE = """(() => { const c = document.getElementById('torqueplot');
@@ -96,7 +95,7 @@ def test_the_page_serves_so_many_connections_at_a_time_and_leaves_those_that_say
 
 
 def test_who_says_a_byte_now_and_then_gives_way_too(web, monkeypatch):
-    monkeypatch.setattr("drivelink.monitor.webserver.PATIENCE_S", 0.3)
+    monkeypatch.setattr("drivelink.monitor.web.PATIENCE_S", 0.3)
     slow = [connect(web) for _ in range(MAX_CONNECTIONS)]
 
     def drip():

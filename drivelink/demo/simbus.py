@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import can
@@ -33,19 +34,18 @@ _SO_TIMESTAMPNS = 35  # socket(7): the kernel stamps what arrives; Linux
 _STAMP = struct.Struct("@qq")  # s, ns
 
 
+@dataclass(slots=True, eq=False)
 class _Client:
     """One connection: protocol state and unsent bytes."""
 
-    __slots__ = ("hold_until_s", "open", "pending", "raw", "received", "socket", "stamp_s", "unsent")
-
-    def __init__(self, connection: socket.socket) -> None:
-        self.socket = connection
-        self.received = ""
-        self.stamp_s = time.time()  # of what was received last
-        self.unsent = bytearray()
-        self.open = self.raw = False
-        self.hold_until_s = 0.0
-        self.pending: list[bytes] = []
+    socket: socket.socket
+    received: str = ""
+    stamp_s: float = field(default_factory=time.time)  # of what was received last
+    unsent: bytearray = field(default_factory=bytearray)
+    open: bool = False
+    raw: bool = False
+    hold_until_s: float = 0.0
+    pending: list[bytes] = field(default_factory=list)
 
 
 class SocketcandServer(can.BusABC):

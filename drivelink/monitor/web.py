@@ -8,13 +8,14 @@ import json
 import math
 import os
 import shutil
+import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -28,12 +29,13 @@ from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.webaccept import ACTIONS, WebAcceptance
 from drivelink.monitor.webday import WebDay
-from drivelink.monitor.webserver import PATIENCE_S, Server
 from drivelink.output.numbers import number
 from drivelink.pubsub.feed import decode_document
 from drivelink.pubsub.publisher import finite, to_json
 from estimator.sample import Sample
 
+MAX_CONNECTIONS = 16
+PATIENCE_S = 5.0  # for a whole request, however slowly it comes, and with a silent browser
 MAX_STREAMS = 8
 _MOST_BODY = 4096  # bytes of a request of the page
 _DETAILS = 16  # lines of a finding
@@ -82,7 +84,7 @@ class WebView:
             web = view
 
         try:
-            self._server = Server(("127.0.0.1", port), Handler)
+            self._server = _Server(("127.0.0.1", port), Handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise UsageError(f"--port {port}: cannot be served: {reason}") from error
@@ -253,6 +255,49 @@ def _finding(found: Mapping[str, Any], shown: Shown) -> dict[str, Any] | None:
         "details": [str(text) for part in listed if isinstance(part, list) for text in part[:_DETAILS]],
         "error": pair if all(isinstance(value, float) for value in pair) else [],
     }
+
+
+class _Server(ThreadingHTTPServer):
+    """One thread per connection, with a limit on connections."""
+
+    daemon_threads = True
+    request_queue_size = 2 * MAX_CONNECTIONS
+
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+        self._room = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        super().__init__(address, handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection, or refuse it if there are too many."""
+        if self._room.acquire(blocking=False):
+            super().process_request(request, client_address)
+            return
+        with suppress(OSError):
+            request.settimeout(0.1)
+            request.sendall(
+                b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+            )
+        self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve a connection to its end."""
+        late = threading.Timer(PATIENCE_S, _hear_no_more, (request,))
+        late.daemon = True
+        late.start()
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            late.cancel()
+            self._room.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore connections that end early."""
+
+
+def _hear_no_more(request: Any) -> None:
+    """End what a browser says; an answer goes on."""
+    with suppress(OSError):
+        request.shutdown(socket.SHUT_RD)
 
 
 class _Handler(BaseHTTPRequestHandler):

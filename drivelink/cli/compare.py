@@ -26,12 +26,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("b", type=Path, metavar="B", help="joint file or recording")
     parser.add_argument("--joint", type=Path, metavar="JOINT", help="joint file of the recordings")
     add_number(parser, "--horizon", metavar="S", help="time between new starts of a free run (default: 1)")
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="write comparison.json and comparison.html there"
-    )
-    parser.add_argument(
-        "--json", action="store_true", help="print the content of comparison.json, nothing else"
-    )
+    about = "write comparison.json and comparison.html there"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=about)
+    about = "print the content of comparison.json, nothing else"
+    parser.add_argument("--json", action="store_true", help=about)
     add_map(parser)
 
 

@@ -37,16 +37,10 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `demo`."""
-    parser.add_argument(
-        "--case",
-        choices=CASES,
-        default="vsa-ii",
-        metavar="CASE",
-        help=f"{', '.join(CASES)} (default: %(default)s)",
-    )
-    add_number(
-        parser, "--seconds", metavar="S", help="of the run (default: 10; where the loop closes, at most 180)"
-    )
+    about = f"{', '.join(CASES)} (default: %(default)s)"
+    parser.add_argument("--case", choices=CASES, default="vsa-ii", metavar="CASE", help=about)
+    about = "of the run (default: 10; where the loop closes, at most 180)"
+    add_number(parser, "--seconds", metavar="S", help=about)
     parser.add_argument("--yes", action="store_true", help="accept without asking, where the loop closes")
     parser.add_argument("--headless", action="store_true", help="plain lines instead of the live view")
     parser.add_argument("--json", action="store_true", help="print one line of JSON and nothing else")

@@ -26,16 +26,11 @@ Writes report.json and report.html into --out (default: the current folder).
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     add_recordings(parser)
-    parser.add_argument(
-        "--validate",
-        type=recording_path,
-        metavar="RECORDING2",
-        help="held-out data: an effect is kept only if it lowers the error there",
-    )
+    about = "held-out data: an effect is kept only if it lowers the error there"
+    parser.add_argument("--validate", type=recording_path, metavar="RECORDING2", help=about)
     parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="where the reports go")
-    parser.add_argument(
-        "--write", type=Path, metavar="JOINT2", help="write a joint file with the effects found"
-    )
+    about = "write a joint file with the effects found"
+    parser.add_argument("--write", type=Path, metavar="JOINT2", help=about)
     parser.add_argument(
         "--motion",
         type=Path,
@@ -43,19 +38,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="design the motion that tells apart what is left open, within [motion] of the joint file: a CSV "
         "file for the controller and `drivelink sim --motion`, a picture beside it",
     )
-    add_number(
-        parser,
-        "--motion-seconds",
-        least=4.0,
-        most=120.0,
-        default=12.0,
-        metavar="S",
-        help="its length (default: %(default)g)",
-    )
+    about = "its length (default: %(default)g)"
+    add_number(parser, "--motion-seconds", least=4.0, most=120.0, default=12.0, metavar="S", help=about)
     parser.add_argument("--force", action="store_true", help="replace the files of --write and --motion")
-    parser.add_argument(
-        "--json", action="store_true", help="print the content of report.json and nothing else"
-    )
+    about = "print the content of report.json and nothing else"
+    parser.add_argument("--json", action="store_true", help=about)
 
 
 def run(args: argparse.Namespace) -> int:

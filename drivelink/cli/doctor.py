@@ -37,20 +37,13 @@ Units and signs of positions and torque are checked while the joint moves under 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument(
-        "joint", nargs="?", type=Path, metavar="JOINT", help="joint file; without: the machine"
-    )
+    about = "joint file; without: the machine"
+    parser.add_argument("joint", nargs="?", type=Path, metavar="JOINT", help=about)
     parser.add_argument("--eds", type=Path, metavar="FILE", help="what the drive of this EDS or DCF can send")
-    add_number(
-        parser,
-        "--seconds",
-        most=3600.0,
-        metavar="S",
-        help=f"for each measurement (default: {_EXAMINED_S:g}, with --move {_AT_REST_S:g})",
-    )
-    parser.add_argument(
-        "--move", action="store_true", help="check each sign and scale with a person who moves the joint"
-    )
+    about = f"for each measurement (default: {_EXAMINED_S:g}, with --move {_AT_REST_S:g})"
+    add_number(parser, "--seconds", most=3600.0, metavar="S", help=about)
+    about = "check each sign and scale with a person who moves the joint"
+    parser.add_argument("--move", action="store_true", help=about)
     add_bus(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 

@@ -31,9 +31,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="write fit.json there")
     parser.add_argument("--write", type=Path, metavar="JOINT2", help="write a copy of the joint file")
     parser.add_argument("--force", action="store_true", help="replace the file of --write if it exists")
-    parser.add_argument(
-        "--plots", nargs="?", type=Path, const=Path(), metavar="DIR", help="write plots there, or into --out"
-    )
+    about = "write plots there, or into --out"
+    parser.add_argument("--plots", nargs="?", type=Path, const=Path(), metavar="DIR", help=about)
     parser.add_argument("--json", action="store_true", help="print the content of fit.json and nothing else")
 
 

@@ -43,46 +43,26 @@ fleet.html and fleet.json. Recordings that are in the table are skipped: run the
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.usage = "drivelink fleet --joints DIR [options] RECORDINGS ...\n       drivelink fleet report DIR"
-    parser.add_argument(
-        "recordings",
-        nargs="+",
-        metavar="RECORDINGS",
-        help="measured data; or `report` and the folder of results",
-    )
+    about = "measured data; or `report` and the folder of results"
+    parser.add_argument("recordings", nargs="+", metavar="RECORDINGS", help=about)
     parser.add_argument("--joints", type=Path, metavar="DIR", help="folder of joint files, one per joint")
-    parser.add_argument(
-        "--out", default="fleet", metavar="DIR", help="folder or URL of the results (default: fleet)"
-    )
-    parser.add_argument(
-        "--since", metavar="DATE", help="omit earlier recordings: 2026-11-22, or 30d, 4w for days, weeks"
-    )
-    parser.add_argument(
-        "--scheduler", metavar="ADDRESS", help="a running Dask scheduler, e.g. tls://10.0.0.5:8786"
-    )
-    parser.add_argument(
-        "--insecure",
-        action="store_true",
-        help="accept a scheduler without TLS: anybody who reaches it runs code on its workers",
-    )
-    add_number(
-        parser,
-        "--workers",
-        whole=True,
-        metavar="N",
-        help="processes on this machine (default: one per CPU core)",
-    )
-    parser.add_argument(
-        "--memory", metavar="SIZE", help="limit of each worker, e.g. 2GiB; a larger recording is split"
-    )
-    parser.add_argument(
-        "--validate",
-        choices=["previous"],
-        help="validate on the joint's previous recording instead of held-out blocks",
-    )
+    about = "folder or URL of the results (default: fleet)"
+    parser.add_argument("--out", default="fleet", metavar="DIR", help=about)
+    about = "omit earlier recordings: 2026-11-22, or 30d, 4w for days, weeks"
+    parser.add_argument("--since", metavar="DATE", help=about)
+    about = "a running Dask scheduler, e.g. tls://10.0.0.5:8786"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=about)
+    about = "accept a scheduler without TLS: anybody who reaches it runs code on its workers"
+    parser.add_argument("--insecure", action="store_true", help=about)
+    about = "processes on this machine (default: one per CPU core)"
+    add_number(parser, "--workers", whole=True, metavar="N", help=about)
+    about = "limit of each worker, e.g. 2GiB; a larger recording is split"
+    parser.add_argument("--memory", metavar="SIZE", help=about)
+    about = "validate on the joint's previous recording instead of held-out blocks"
+    parser.add_argument("--validate", choices=["previous"], help=about)
     parser.add_argument("--again", action="store_true", help="repeat recordings that are in the table")
-    parser.add_argument(
-        "--json", action="store_true", help="print the content of fleet.json and nothing else"
-    )
+    about = "print the content of fleet.json and nothing else"
+    parser.add_argument("--json", action="store_true", help=about)
 
 
 def run(args: argparse.Namespace) -> int:

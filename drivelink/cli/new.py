@@ -44,12 +44,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--examples", type=Path, metavar="DIR", help="copy the examples into DIR, no more")
     parser.add_argument("--scan", action="store_true", help="take the nodes from what answers on the bus")
     parser.add_argument("--name", help="name of the joint")
-    parser.add_argument(
-        "--arrangement",
-        choices=_ARRANGEMENTS,
-        metavar="KIND",
-        help=f"how the motors act on the joint: {', '.join(_ARRANGEMENTS)}",
-    )
+    about = f"how the motors act on the joint: {', '.join(_ARRANGEMENTS)}"
+    parser.add_argument("--arrangement", choices=_ARRANGEMENTS, metavar="KIND", help=about)
     number = partial(add_number, parser)
     about = "rotor inertia of each motor, g·cm² (data sheet)"
     number("--rotor-inertia", dest="rotor_inertia_gcm2", metavar="G_CM2", help=about)
@@ -59,9 +55,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     number("--torque-constant", dest="torque_constant_mnm_a", metavar="MNM_A", help=about)
     about = "damping of each motor, joint side"
     number("--damping", least=0.0, dest="viscous_damping_nm_s_rad", metavar="NM_S_RAD", help=about)
-    parser.add_argument(
-        "--model", choices=_MODELS, metavar="MODEL", help=f"model of the transmission: {', '.join(_MODELS)}"
-    )
+    about = f"model of the transmission: {', '.join(_MODELS)}"
+    parser.add_argument("--model", choices=_MODELS, metavar="MODEL", help=about)
     about = "node ID of a drive; twice for a VSA"
     number("--node", least=1, most=127, whole=True, dest="nodes", action="append", metavar="ID", help=about)
     number("--gear", dest="gear_ratio", metavar="RATIO", help="motor revolutions per joint revolution")

@@ -56,17 +56,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("joint", type=Path, metavar="JOINT", help="joint file")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the recording")
     add_seconds(parser)
-    parser.add_argument(
-        "--source",
-        choices=("auto", "daemon", "bus"),
-        default="auto",
-        help="listen to the daemon, to the bus, or to what is there (default)",
-    )
+    about = "listen to the daemon, to the bus, or to what is there (default)"
+    parser.add_argument("--source", choices=("auto", "daemon", "bus"), default="auto", help=about)
     add_bus(parser)
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
-    parser.add_argument(
-        "--layouts", type=Path, metavar="DIR", help="write layouts of Foxglove and PlotJuggler there"
-    )
+    about = "write layouts of Foxglove and PlotJuggler there"
+    parser.add_argument("--layouts", type=Path, metavar="DIR", help=about)
     parser.add_argument("--json", action="store_true", help="print what was recorded as one JSON object")
 
 

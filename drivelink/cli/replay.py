@@ -47,18 +47,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace the CSV of --out if it exists")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="write plots of the estimates")
     parser.add_argument("--publish", action="store_true", help="put samples and estimates on zenoh")
-    add_number(
-        parser,
-        "--speed",
-        metavar="X",
-        help="X times the speed of the recording (default: as fast as it goes)",
-    )
-    parser.add_argument(
-        "--strict", action="store_true", help="refuse what has wrong units, signs or gears; else only warn"
-    )
-    parser.add_argument(
-        "--frames", action="store_true", help="of an MCAP file, decode the raw CAN frames, not the samples"
-    )
+    about = "X times the speed of the recording (default: as fast as it goes)"
+    add_number(parser, "--speed", metavar="X", help=about)
+    about = "refuse what has wrong units, signs or gears; else only warn"
+    parser.add_argument("--strict", action="store_true", help=about)
+    about = "of an MCAP file, decode the raw CAN frames, not the samples"
+    parser.add_argument("--frames", action="store_true", help=about)
     parser.add_argument("--channel", help="of a raw CAN log with several, the one the joint is on")
     add_map(parser)
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")

@@ -39,27 +39,17 @@ _LEVELS = ("debug", "info", "warning", "error")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `run`."""
-    parser.add_argument(
-        "joints", nargs="+", type=Path, metavar="JOINT", help="joint files; several share one bus"
-    )
+    about = "joint files; several share one bus"
+    parser.add_argument("joints", nargs="+", type=Path, metavar="JOINT", help=about)
     add_seconds(parser, "run until stopped")
     add_bus(parser)
     parser.add_argument("--no-publish", action="store_true", help="compute, but publish nothing")
-    parser.add_argument(
-        "--no-realtime", action="store_true", help="do not ask for real-time scheduling and locked memory"
-    )
-    parser.add_argument(
-        "--log-level",
-        choices=_LEVELS,
-        default="info",
-        metavar="LEVEL",
-        help=f"least severe messages that go to stderr: {', '.join(_LEVELS)}",
-    )
-    parser.add_argument(
-        "--json",
-        action="store_true",
-        help="print one JSON object when it is ready, and one at the end: the joints' last status",
-    )
+    about = "do not ask for real-time scheduling and locked memory"
+    parser.add_argument("--no-realtime", action="store_true", help=about)
+    about = f"least severe messages that go to stderr: {', '.join(_LEVELS)}"
+    parser.add_argument("--log-level", choices=_LEVELS, default="info", metavar="LEVEL", help=about)
+    about = "print one JSON object when it is ready, and one at the end: the joints' last status"
+    parser.add_argument("--json", action="store_true", help=about)
 
 
 def run(args: argparse.Namespace) -> int:

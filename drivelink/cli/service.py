@@ -29,25 +29,14 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument(
-        "action", metavar="ACTION", choices=("install", "uninstall"), help="install or uninstall"
-    )
+    about = "install or uninstall"
+    parser.add_argument("action", metavar="ACTION", choices=("install", "uninstall"), help=about)
     parser.add_argument("joint", metavar="JOINT", help="joint file; for uninstall also its name")
     parser.add_argument("--root", type=Path, metavar="DIR", help="write below this folder, and start nothing")
-    parser.add_argument(
-        "--allow",
-        action="append",
-        default=[],
-        metavar="ADDRESS",
-        help="address that may connect besides this machine; may be repeated",
-    )
-    parser.add_argument(
-        "--credential",
-        action="append",
-        default=[],
-        metavar="NAME=FILE",
-        help="file of a key that zenoh.config names; may be repeated",
-    )
+    about = "address that may connect besides this machine; may be repeated"
+    parser.add_argument("--allow", action="append", default=[], metavar="ADDRESS", help=about)
+    about = "file of a key that zenoh.config names; may be repeated"
+    parser.add_argument("--credential", action="append", default=[], metavar="NAME=FILE", help=about)
     add_bus(parser)
     parser.add_argument("--force", action="store_true", help="replace existing files that differ")
     parser.add_argument("--json", action="store_true", help="print what was done as one JSON object")

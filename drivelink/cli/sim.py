@@ -38,21 +38,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="switch an effect on in the world, e.g. coulomb_friction=0.25; further parameters follow after "
         "commas (cogging=0.1,periods_per_rev=12,motor=2); may be repeated",
     )
-    parser.add_argument(
-        "--motion",
-        type=Path,
-        metavar="FILE",
-        help="the motors follow this motion, over and over: a CSV file of `diagnose --motion`",
-    )
-    parser.add_argument(
-        "--quirks", metavar="NAME", help="drives that behave like a vendor's, e.g. epos4; see the reference"
-    )
+    about = "the motors follow this motion, over and over: a CSV file of `diagnose --motion`"
+    parser.add_argument("--motion", type=Path, metavar="FILE", help=about)
+    about = "drives that behave like a vendor's, e.g. epos4; see the reference"
+    parser.add_argument("--quirks", metavar="NAME", help=about)
     add_bus(parser)
     add_seconds(parser)
     add_number(parser, "--seed", least=0, whole=True, help="seed of the sensor noise")
-    parser.add_argument(
-        "--write-eds", type=Path, metavar="DIR", help="also write the EDS file of every simulated node"
-    )
+    about = "also write the EDS file of every simulated node"
+    parser.add_argument("--write-eds", type=Path, metavar="DIR", help=about)
     parser.add_argument("--json", action="store_true", help="print one JSON object when ready")
 
 

@@ -272,11 +272,8 @@ def bus_load(layouts: Iterable[NodeLayout], bus: BusSection) -> BusLoad:
         ]
         if layout.heartbeat_ms:
             frames.append((1000 / layout.heartbeat_ms, frame_bits(1)))
-    return BusLoad(
-        bits_per_s=sum(rate * bits for rate, bits in frames),
-        bitrate=bus.bitrate,
-        frames_per_s=sum(rate for rate, _ in frames),
-    )
+    bits_per_s, frames_per_s = sum(rate * bits for rate, bits in frames), sum(rate for rate, _ in frames)
+    return BusLoad(bits_per_s=bits_per_s, bitrate=bus.bitrate, frames_per_s=frames_per_s)
 
 
 def check_capacity(load: BusLoad, period_s: float) -> None:

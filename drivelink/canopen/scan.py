@@ -143,9 +143,5 @@ def _identify(node: int) -> Program[FoundNode]:
         name = yield Read(node, 0x1008, 0)
     except SdoAbort:
         name = b""
-    return FoundNode(
-        node_id=node,
-        device_type=device_type,
-        identity=identity,
-        name=clean_text(name.rstrip(b"\0 ").decode("latin-1"), _LONGEST_NAME),
-    )
+    shown = clean_text(name.rstrip(b"\0 ").decode("latin-1"), _LONGEST_NAME)
+    return FoundNode(node_id=node, device_type=device_type, identity=identity, name=shown)

@@ -63,11 +63,8 @@ def run(args: argparse.Namespace) -> int:
             return _by_hand(joint, args, seconds)
         report = examine(joint, args.joint.parent if args.joint else Path(), seconds)
         if joint is not None and left_open(joint, args.joint.read_text(encoding="utf-8")):
-            report.section("Joint file").warn(
-                "motor",
-                "inertia_kg_m2 is the placeholder of drivelink new",
-                "put in your motor's, joint side",
-            )
+            text, fix = "inertia_kg_m2 is the placeholder of drivelink new", "put in your motor's, joint side"
+            report.section("Joint file").warn("motor", text, fix)
     if args.json:
         print(json.dumps(report.as_dict()))
     else:

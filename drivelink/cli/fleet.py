@@ -106,10 +106,8 @@ def _run(args: argparse.Namespace) -> int:
     from drivelink.fleet.joints import Joints
 
     if settings.scheduler and not settings.scheduler.startswith("tls://") and settings.insecure:
-        print(
-            f"--scheduler {settings.scheduler}: without TLS: anybody who reaches it runs code on its workers",
-            file=sys.stderr,
-        )
+        text = "without TLS: anybody who reaches it runs code on its workers"
+        print(f"--scheduler {settings.scheduler}: {text}", file=sys.stderr)
     joints = Joints.load(args.joints)
     sources, empty = storage.find(args.recordings)
     for pattern in empty:
@@ -132,10 +130,8 @@ def _run(args: argparse.Namespace) -> int:
         try:
             counts = runner.run(sources, joints, storage.Store(args.out), settings, progress, say)
         except KeyboardInterrupt:
-            print(
-                f"interrupted; what was finished is in {args.out}: repeat the command to continue",
-                file=sys.stderr,
-            )
+            text = f"interrupted; what was finished is in {args.out}: repeat the command to continue"
+            print(text, file=sys.stderr)
             raise
     if said > _WARNINGS:
         print(f"and {said - _WARNINGS} lines more", file=sys.stderr)

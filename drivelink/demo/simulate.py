@@ -225,11 +225,8 @@ def _scale(joint: JointFile, given: Case | None) -> LinkEncoder | None:
     assumed = given.encoder if given else LinkEncoder()
     if encoder is None:
         return assumed
-    return LinkEncoder(
-        counts_per_rev=encoder.counts_per_rev or assumed.counts_per_rev,
-        direction=encoder.direction,
-        zero_rad=-encoder.offset_rad,
-    )
+    counts = encoder.counts_per_rev or assumed.counts_per_rev
+    return LinkEncoder(counts_per_rev=counts, direction=encoder.direction, zero_rad=-encoder.offset_rad)
 
 
 # Devices

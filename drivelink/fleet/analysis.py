@@ -61,12 +61,8 @@ def analyse(
         "samples": len(record),
         "period_s": record.period_s,
     }
-    return Analysis(
-        shared,
-        [_row(number, one) for number, one in enumerate(identify(record, model).fits, start=1)],
-        json.dumps(document, indent=2) + "\n",
-        report.html_page(outcome, title),
-    )
+    each = [_row(number, one) for number, one in enumerate(identify(record, model).fits, start=1)]
+    return Analysis(shared, each, json.dumps(document, indent=2) + "\n", report.html_page(outcome, title))
 
 
 def _names(outcome: Diagnosis) -> list[str]:

@@ -10,3 +10,6 @@ In the run the loop alone reads the bus. It calls `configurator.start(node)` aft
 `configure = false` it is a `PassiveConfigurator` with the same methods, which sends nothing, also takes the
 frames 0x601 to 0x67F, and reports in `poll` when another master has changed a mapping.
 """
+
+Address = tuple[int, int]
+"""Index and subindex of an object."""

@@ -12,14 +12,13 @@ from pathlib import Path
 
 from canopen.objectdictionary import ODVariable, datatypes
 
+from drivelink.canopen import Address
 from drivelink.canopen.pdo import Tpdo, tpdos_of
 from drivelink.errors import DriveError, raised_as
 from drivelink.files import read_regular
 from drivelink.plaintext import clean_text
 
 Sections = dict[str, dict[str, str]]
-Address = tuple[int, int]
-
 MAX_BYTES = 4 << 20  # the longest in circulation have 1 MiB
 _MOST_OBJECTS = 20_000  # compact arrays expanded; of those, some 2000
 _MOST_DIGITS = 40  # of a number: 64 bits in binary notation are not written

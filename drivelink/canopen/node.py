@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from drivelink._core import SYNC_COB_ID
+from drivelink.canopen import Address
 from drivelink.canopen.layout import MappedObject, NodeLayout, Offer, Role, Signal
 from drivelink.canopen.mapping import NMT_PRE_OPERATIONAL, NMT_START, SETTLE_S, Mapper, disable
 from drivelink.canopen.pdo import (
@@ -35,8 +36,6 @@ from drivelink.canopen.vendors import Vendor, vendor_of
 from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection
 from drivelink.notice import Findings
-
-Address = tuple[int, int]
 
 _SYNC_PRODUCER = 1 << 30
 _ENCODER_HEARTBEAT_MS = 100

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
+from drivelink.canopen import Address
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.layout import NodeLayout, Offer, Role, Signal
 from drivelink.canopen.pdo import OPTIONAL, Tpdo, decode, describe, objects_of, tpdos_of
@@ -12,8 +13,6 @@ from drivelink.canopen.vendors import VENDORS, vendor_of
 from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection, TpdoSection
 from drivelink.notice import Notice
-
-Address = tuple[int, int]
 
 _IDENTITY = tuple((0x1018, subindex) for subindex in (1, 2, 3, 4))
 _STORED = ((0x1020, 1), (0x1020, 2))  # date and time of the configuration

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+from drivelink.canopen import Address
 from drivelink.canopen.layout import MappedObject, Role, Signal, TpdoLayout
 from drivelink.canopen.sdo import Program, SdoAbort, read_number
 from drivelink.errors import DriveError
 
-Address = tuple[int, int]
 Entry = tuple[int, int, int]  # index, subindex, bits
 
 ABSENT = frozenset({0x06020000, 0x06090011})  # SDO aborts: no such object, no such subindex

@@ -13,6 +13,7 @@ from typing import Generic, TypeVar
 from canopen.sdo.exceptions import SdoAbortedError
 
 from drivelink._core import SdoTransfers
+from drivelink.canopen import Address
 from drivelink.canopen.guard import check_frame
 from drivelink.errors import DriveError
 
@@ -302,8 +303,6 @@ class Session(Generic[T]):
         check_frame(cob_id, data)
         self._send(cob_id, data)
 
-
-Address = tuple[int, int]
 
 _DOWNLOAD, _BLOCK_DOWNLOAD = 1, 6  # commands of the client
 

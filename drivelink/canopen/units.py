@@ -10,12 +10,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
+from drivelink.canopen import Address
 from drivelink.canopen.layout import MappedObject, Offer, Role, Signal, object_address
 from drivelink.canopen.vendors import Vendor, angle_unit_rad, velocity_unit_rad_s
 from drivelink.jointfile import DriveSection, EncoderSection
 from estimator.ranges import range_of
-
-Address = tuple[int, int]
 
 _DRIVE_OBJECTS: tuple[Address, ...] = (
     *((index, subindex) for index in (0x608F, 0x6091, 0x6092) for subindex in (1, 2)),

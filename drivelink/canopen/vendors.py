@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-Address = tuple[int, int]
+from drivelink.canopen import Address
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,12 +16,12 @@ from itertools import count, islice
 from typing import Any, NamedTuple
 
 from drivelink._core import Assembler
+from drivelink.canopen import Address
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal
 from drivelink.canopen.sdo import Pause, Program, Read, SdoSniffer, Session
 from drivelink.errors import DriveError
 from estimator.sample import Sample
 
-Address = tuple[int, int]
 Samples = Callable[[int, int], Sequence[Sample]]
 Pick = Callable[[Sample], float]
 

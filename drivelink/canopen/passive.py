@@ -64,8 +64,7 @@ class PassiveConfigurator:
     def adopt(self, layouts: Iterable[NodeLayout]) -> None:
         """Adopt layouts from another source; later traffic has priority."""
         for layout in layouts:
-            node = self._nodes.get(layout.node_id)
-            if node is not None:
+            if (node := self._nodes.get(layout.node_id)) is not None:
                 node.adopted = self.layouts[layout.node_id] = layout
                 self.missing.pop(layout.node_id, None)
                 self.doubts.pop(layout.node_id, None)

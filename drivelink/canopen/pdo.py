@@ -279,8 +279,7 @@ def assign(
         DriveError: a needed signal cannot be mapped; the message shows the mappings.
     """
     wanted = {signal: list(candidates) for signal, candidates in available.items() if candidates}
-    result = _free(list(wanted.items()), tpdos, prefer_unused)
-    if result is not None:
+    if (result := _free(list(wanted.items()), tpdos, prefer_unused)) is not None:
         return result
     kept: list[Assignment] = []
     fixed = [tpdo for tpdo in tpdos if tpdo.fixed]

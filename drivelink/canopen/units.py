@@ -220,8 +220,7 @@ class _Drive:
 
     def _velocity(self, counts: float | None, gear: float) -> None:
         reported, source = None, "0x60A9"
-        unit = self._reported.get((0x60A9, 0))
-        if unit:
+        if unit := self._reported.get((0x60A9, 0)):
             reported = velocity_unit_rad_s(unit, counts)
         if reported is None and self._vendor.velocity_rad_s is not None:
             reported, source = self._vendor.velocity_rad_s, self._vendor.name

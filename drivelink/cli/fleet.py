@@ -67,8 +67,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the verb; return the exit status."""
-    missing = [name for name in _NEEDS if importlib.util.find_spec(name) is None]
-    if missing:
+    if missing := [name for name in _NEEDS if importlib.util.find_spec(name) is None]:
         raise UsageError(f"needs {', '.join(missing)}: install the extra, pip install 'drivelink-vsa[fleet]'")
     if args.recordings[0] == _REPORT and args.joints is None:
         if len(args.recordings) != 2:

@@ -132,8 +132,7 @@ def _case_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
     if args.name:
         document["name"] = args.name
     for key in ("interface", "channel", "bitrate"):
-        value = getattr(args, key)
-        if value is not None:
+        if (value := getattr(args, key)) is not None:
             document["bus"][key] = value
     text = tomlkit.dumps(document)
     return text, parse(text, "these answers").name, []

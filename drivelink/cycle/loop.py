@@ -208,8 +208,7 @@ class CycleLoop:
                 self._foreign_sync(data, stamp_ns, now_ns)
                 continue
             for loop_joint in interested.get(cob_id, ()):
-                tick = self._feed(loop_joint, cob_id, data)
-                if tick is not None:
+                if (tick := self._feed(loop_joint, cob_id, data)) is not None:
                     self._publish(loop_joint, tick, now_ns)
                     loop_joint.response.add(now_ns - self.sync_ns)
             if cob_id in listeners:

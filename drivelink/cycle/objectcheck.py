@@ -168,8 +168,7 @@ class ObjectCheck:
 
     def request(self, node_id: int, data: bytes, now_s: float) -> None:
         """Process an SDO frame of a master."""
-        node = self._nodes.get(node_id)
-        if node is not None:
+        if (node := self._nodes.get(node_id)) is not None:
             node.asked = node.assembler.sequence
             node.sniffer.request(data, now_s)
 
@@ -188,8 +187,7 @@ class ObjectCheck:
         found = []
         for node_id, node in self._nodes.items():
             while node.answers and node.assembler.sequence > node.answers[0].answered + _AROUND:
-                mismatch = _judge(node, node.answers.popleft())
-                if mismatch is not None:
+                if (mismatch := _judge(node, node.answers.popleft())) is not None:
                     node.assembler.distrust(node_id)
                     found.append(mismatch)
         return found

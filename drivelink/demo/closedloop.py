@@ -221,8 +221,7 @@ def closing(document: Mapping[str, Any]) -> Section:
         )  # fmt: skip
         rows.append((key, number(one["truth"]), found, f"± {half}" if half else ""))
     lines = []
-    error = document["error"]
-    if error is not None:
+    if (error := document["error"]) is not None:
         before, after = (f"{number(error[f'{when}_rms_nm'], 3)} N·m" for when in ("before", "after"))
         shares = (f"{percent(error[f'{when}_relative'], 2)} {when}" for when in ("before", "after"))
         relative = ", ".join(shares)

@@ -249,8 +249,7 @@ def nodes_from_joint(
     host = None
     if encoder is not None and encoder.source == "drive":
         host = encoder.node_id or (joint.motor[0].drive.node_id if joint.motor[0].drive else None)
-        place = re.fullmatch(r"0x60[Ee]4:(\d+)", encoder.object or "")
-        if place:
+        if place := re.fullmatch(r"0x60[Ee]4:(\d+)", encoder.object or ""):
             own = replace(own, second_encoder=int(place[1]))
     nodes: list[Node] = []
     for index, motor in enumerate(joint.motor):

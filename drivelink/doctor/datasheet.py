@@ -79,8 +79,7 @@ def report_checks(
     encoder = found.pop("second_encoder", None)
 
     def report(text: str, objects: Available, line: str) -> None:
-        frames = _cost(role, wanted, objects, tpdos)
-        if frames is not None:
+        if (frames := _cost(role, wanted, objects, tpdos)) is not None:
             section.info("cross-check", f"{text}: {_frames(frames)}", f"[motor.drive] {line}")
 
     def checks(names: Iterable[str]) -> str:

@@ -291,8 +291,7 @@ def judge_link(section: Section, link: dict[str, Any], bus: BusSection) -> None:
         section.warn(name, text, f"sudo ip link set {name} txqueuelen 1000")
     if link.get("mtu", 16) > 16:
         section.info(name, "CAN FD: FD frames are accepted, CANopen uses the classic ones")
-    dropped = link.get("stats64", {}).get("rx", {}).get("dropped", 0)
-    if dropped:
+    if dropped := link.get("stats64", {}).get("rx", {}).get("dropped", 0):
         section.warn(name, f"{dropped} received frames were dropped since it is up")
 
 
@@ -318,6 +317,5 @@ def _judge_controller(section: Section, data: dict[str, Any], info: dict[str, An
     if not data.get("restart_ms"):
         fix = f"{down} && sudo ip link set {name} type can restart-ms 100 && {up}"
         section.warn(name, "does not recover from bus-off by itself", fix)
-    offs = info.get("info_xstats", {}).get("bus_off", 0)
-    if offs:
+    if offs := info.get("info_xstats", {}).get("bus_off", 0):
         section.warn(name, f"was bus-off {offs} times since it is up")

@@ -101,8 +101,7 @@ class Joints:
         Raises:
             RecordingError: it carries no joint file, and its name contains none or several of the joints.
         """
-        carried = carried_joint(path)
-        if carried is not None:
+        if (carried := carried_joint(path)) is not None:
             return self.by_name.get(carried.name, carried)
         return self.named(url)
 

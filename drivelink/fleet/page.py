@@ -286,8 +286,7 @@ def _strip(joint: dict[str, Any], effect: dict[str, Any], frame: _Frame, y: floa
     place = for_page(spaced(effect["location"]))
     parts = [f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{place}</text>']
     for one in joint["diagnoses"]:
-        names = [name for name in one["effects"] if name.endswith(f"@{effect['location']}")]
-        if names:
+        if names := [name for name in one["effects"] if name.endswith(f"@{effect['location']}")]:
             tip = f"{_minute(one['time'])}: {', '.join(names)}"
             parts.append(_link(one["report"], _dot(frame.x(one["time"]), y, kind, tip)))
     return "".join(parts)

@@ -345,8 +345,7 @@ class JointFile(_Section):
         nodes: list[int | None] = [m.drive.node_id for m in self.motor if m.drive]
         if self.link.encoder and self.link.encoder.source == "cia406":
             nodes.append(self.link.encoder.node_id)
-        twice = {node for node in nodes if nodes.count(node) > 1}
-        if twice:
+        if twice := {node for node in nodes if nodes.count(node) > 1}:
             raise ValueError(
                 f"node_id: expected a node id of its own for each device, got {twice.pop()} twice"
             )

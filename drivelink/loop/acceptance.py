@@ -124,8 +124,7 @@ def undo(path: Path) -> Path:
     _keep(source, f"{datetime.now(UTC):{_STAMP}}-undone")
     _copy(_place(old), _place(source), force=True)
     recording = folder_of(old) / Path(str(accepted.get("recording"))).name
-    found = finding.read(recording)
-    if found is not None:
+    if (found := finding.read(recording)) is not None:
         with suppress(RecordingError):
             finding.write(recording, {**found, "state": finding.UNDONE})
     return Path(old.name)

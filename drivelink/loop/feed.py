@@ -42,8 +42,7 @@ class SnapshotFeed(_Feed):
         return self._publisher.snapshot_wanted and time.monotonic() >= self._due_s
 
     def _work(self) -> None:
-        made = self._pipeline.snapshot()
-        if made is not None:
+        if (made := self._pipeline.snapshot()) is not None:
             self._due_s = time.monotonic() + _SNAPSHOT_S
             self._publisher.put_snapshot(*made)
 

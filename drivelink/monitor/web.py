@@ -199,8 +199,7 @@ def _now(view: JointView) -> dict[str, Any]:
         "external": _touch(touch) if touch else None,
         "external_not_valid": view.external_doubt() or None,
     }
-    estimate = view.history.latest
-    if estimate is not None:
+    if (estimate := view.history.latest) is not None:
         event["estimate"] = {
             "stiffness": estimate.stiffness_nm_rad,
             "std": estimate.stiffness_std_nm_rad,

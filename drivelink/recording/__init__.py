@@ -46,8 +46,7 @@ def read(
         raise RecordingError(f"{path}: expected a file, got a folder")
     if command := CONVERTERS.get(path.suffix.lower()):
         raise RecordingError(f"{path}: not a format of recordings; to convert it: {command.format(path)}")
-    read_columns = FORMATS.get(path.suffix.lower(), FORMATS[".csv"]).columns
-    if read_columns is not None:
+    if (read_columns := FORMATS.get(path.suffix.lower(), FORMATS[".csv"]).columns) is not None:
         names = column_map(joint, names)
         columns, ignored = read_columns(path, names)
         ours = renamed(columns, names, str(path), ignored)

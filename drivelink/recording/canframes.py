@@ -172,8 +172,7 @@ class FrameLog:
                 now_s = seconds(stamp_ns, len(syncs), listener.bus.period_s)
                 if not listener.feed(can_id, data, now_s):
                     continue
-                changed = listener.poll(now_s)
-                if changed:
+                if listener.poll(now_s):
                     head.clear()
                     quiet, heard, before = 0, True, before or (not heard and bool(syncs))
         return list(syncs), heard and not listener.busy, before

@@ -80,16 +80,14 @@ class Gathered:
 
     def write(self, played: Played) -> None:
         """Add a cycle of a replay."""
-        sample = played.tick.sample if len(self._samples) < self._most else None
-        if sample is not None:
+        if (sample := played.tick.sample) is not None and len(self._samples) < self._most:
             self._samples.append(sample)
 
     def remarks(self, *, live: bool) -> list[str]:
         """Return findings with corrections, or what the motion does not reveal, one line each."""
         model, judgement = self._joint.model(), Judgement(reason="no samples in one run of numbers")
         try:
-            record = _record_of(self._samples, model, self._period_s, self._most)
-            if record is not None:
+            if (record := _record_of(self._samples, model, self._period_s, self._most)) is not None:
                 judgement = judge(record, model)
         except EstimatorError as error:
             return [f"units and signs cannot be checked: {error}"]
@@ -154,8 +152,7 @@ def corrections(joint: JointFile, needed: Sequence[Change], *, live: bool) -> li
     changes, found = {change.channel: change for change in needed}, list[Correction]()
     for number, motor in enumerate(joint.motor, start=1):
         position, torque = changes.get(f"motor{number}_position"), changes.get(f"motor{number}_torque")
-        inertia = changes.get(f"motor{number}_inertia")
-        if inertia is not None:
+        if (inertia := changes.get(f"motor{number}_inertia")) is not None:
             value = motor.inertia_kg_m2 * inertia.factor
             found.append(Correction(f"motor[{number}]", "inertia_kg_m2", value, inertia.factor))
         if live and motor.drive is not None:

@@ -125,8 +125,7 @@ def _layout(header: str, path: Path, known: frozenset[str]) -> _Layout:
             f"{path}: expected a header with time_s, motor1_position_rad, motor1_torque_nm, …, found "
             f"{some(names, 40)} (--map SOURCE=COLUMN[:UNIT] or [recording.columns] says which is which)"
         )
-    twice = {name for name in names if name and names.count(name) > 1}
-    if twice:
+    if twice := {name for name in names if name and names.count(name) > 1}:
         raise RecordingError(f"{path}: column {min(twice)} appears twice")
     return _Layout(names, used, tuple(map(names.index, used)), separator)
 

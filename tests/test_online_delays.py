@@ -54,3 +54,43 @@ def test_a_torque_that_is_reported_late_is_published_for_the_present(spin, link_
     error = np.std(found.torque_nm[SETTLED] - true)
     waiting = np.std(K * _motion(t - LATE_S, spin)[2][SETTLED] - true)
     assert error < left * np.std(true) < 0.1 * waiting
+
+
+def _stiff(noise_rad, link_late_s=0.0, std=None):
+    """What is found of a stiff, slow joint whose file states all, in closed form (eq 5), and its torque."""
+    t, stiff, rng = T * np.arange(N), 6000.0, np.random.default_rng(4)
+    waves = ((0.4, 0.6, 0.0), (0.15, 1.3, 0.4), (0.05, 3.1, 1.1))
+
+    def motion(t):
+        theta = sum(a * np.sin(w * t + p) for a, w, p in waves)
+        rate = sum(a * w * np.cos(w * t + p) for a, w, p in waves)
+        phi = 2e-4 * np.sin(0.7 * t + 0.3) + 1e-4 * np.sin(2.3 * t)
+        acceleration = -sum(a * w**2 * np.sin(w * t + p) for a, w, p in waves)
+        return theta, B * acceleration + D * rate - stiff * phi, phi
+
+    theta, _, phi = motion(t)
+    late_theta, _, late_phi = motion(t - link_late_s)
+    noise = rng.normal(scale=noise_rad, size=(2, N))
+    positions = (
+        joints.quantise(x + n, 1e-6) for x, n in zip((theta, late_theta + late_phi), noise, strict=True)
+    )
+    motor, link = positions
+    read = joints.recorded(motor, motion(t + 0.5 * T)[1], link, T)
+    late = Effect(name="encoder_delay", parameters={"delay_s": link_late_s}, std=std or {})
+    model = joints.joint_model(B, D, model="linear", parameters={"k_nm_rad": stiff}, link_effects=(late,))
+    found, _ = kit.play(model, read.samples())
+    ok, true = found.valid[2000:], stiff * phi[2000:]
+    return np.mean(ok), np.std((found.torque_nm[2000:] - true)[ok]) / np.std(true)
+
+
+def test_a_delay_that_was_fitted_is_as_uncertain_as_the_file_says():
+    """Half a period of a late link is more than the deflection of a stiff joint: of one declared by hand it may be off."""
+    (by_hand, error), (fitted, less) = _stiff(1e-6, 3e-3), _stiff(1e-6, 3e-3, {"delay_s": 1e-5})
+    assert by_hand < 0.98 < 0.99 < fitted
+    assert less < 0.5 * error
+
+
+def test_noise_moves_no_zero():
+    """Half a step does, where a reading cuts off; by a deviation of the noise the zero was unknown for ten seconds."""
+    valid, error = _stiff(1e-5)
+    assert valid > 0.5 and error < 0.05

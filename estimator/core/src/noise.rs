@@ -56,9 +56,13 @@ impl NoiseMeter {
     /// rad², with the resolution that has been seen (∞: none).
     #[must_use]
     pub fn variance(&self, resolution: f64) -> f64 {
-        let rounding =
-            if resolution.is_finite() { self.stairs.max(resolution * resolution) / 12.0 } else { 0.0 };
-        self.measured.max(rounding)
+        self.measured.max(self.step(resolution).powi(2) / 12.0)
+    }
+
+    /// Of the readings, rad, with the resolution that has been seen (∞: none).
+    #[must_use]
+    pub fn step(&self, resolution: f64) -> f64 {
+        if resolution.is_finite() { self.stairs.sqrt().max(resolution) } else { 0.0 }
     }
 }
 
@@ -84,6 +88,15 @@ mod tests {
         }
         let (found, step) = (meter.variance(1e-5), 0.02);
         assert!((found / (step * step / 12.0) - 1.0).abs() < 0.05, "{found}"); // 5 %: the first step's start
+    }
+
+    #[test]
+    fn noise_is_no_step() {
+        let mut meter = NoiseMeter::default();
+        for k in 0..500 {
+            meter.update(if k % 2 == 0 { 0.1 } else { -0.1 }, 1e-3);
+        }
+        assert!((meter.step(1e-3) - 1e-3).abs() < 1e-12 && meter.step(f64::INFINITY) == 0.0);
     }
 
     #[test]

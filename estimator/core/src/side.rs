@@ -307,8 +307,15 @@ impl Side {
 
     /// The row of this moment; what has been found to be shifted.
     ///
-    /// `noise`: variances of θ and q; `torque_noise`: of τ; `gains`: of the filters for white noise.
-    pub fn learn(&mut self, noise: [f64; 2], torque_noise: f64, gains: &[f64; 3]) -> Option<Shift> {
+    /// `noise`: variances of θ and q; `step`: of the deflection's readings; `torque_noise`: of τ; `gains`: of the
+    /// filters for white noise.
+    pub fn learn(
+        &mut self,
+        noise: [f64; 2],
+        step: f64,
+        torque_noise: f64,
+        gains: &[f64; 3],
+    ) -> Option<Shift> {
         self.held_s = 0.0;
         self.unconfirmed_s -= self.period;
         let positions = noise[0] + noise[1];
@@ -321,7 +328,7 @@ impl Side {
             white: in_columns + gains[0] * torque_noise,
             noise: [[deflection, both], [both, acceleration]],
             rounding: if rounding > 0.0 { rounding / deflection } else { 0.0 },
-            resolution: (3.0 * positions).sqrt(),
+            resolution: 0.5 * step,
         };
         let row = self.balance.row();
         let closed = self.blocks.add(&row, self.balance.resting())?;

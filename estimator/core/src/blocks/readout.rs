@@ -2,10 +2,10 @@
 
 use super::Blocks;
 use crate::balance::Balance;
-use crate::choices::{BLOCKS, FEWEST, UNUSUAL, USEFUL};
+use crate::choices::{BLOCKS, FEWEST, SURE, UNUSUAL, USEFUL};
 use crate::gram::{UNKNOWNS, set};
 use crate::unknowns::{
-    ASYMMETRY, CANDIDATES, CLIPS, CORNER, LATE, OFFSET, RATE, Reading, SOFT, STOPS, TORQUE_LATE, ZERO,
+    ASYMMETRY, CANDIDATES, CLIPS, CORNER, LATE, OFFSET, RATE, Reading, SOFT, SPRING, STOPS, TORQUE_LATE, ZERO,
 };
 
 impl Blocks {
@@ -66,14 +66,17 @@ impl Blocks {
         self.posterior.as_ref().map_or(0.0, |known| known.covariance[ZERO][ZERO].sqrt())
     }
 
-    /// The constant torque that is the zero's or the reading's where nothing tells which, N·m: by a straight line, beside
-    /// effects that bend the curve as another zero would, by few rows and none before, or on one side of a law whose
-    /// shape nobody declared; 0: a lost zero, or a curve that is the declared one.
+    /// The constant torque that is the zero's or the reading's where nothing tells which, N·m: by a line that is not
+    /// surely bent, beside effects that bend the curve as another zero would, by few rows and none before, or on one
+    /// side of a law whose shape nobody declared; 0: a lost zero, or a curve that is the declared one.
     #[must_use]
     pub fn zero_torque(&self, stiffness: f64) -> f64 {
         let Some(known) = self.posterior.as_ref().filter(|_| !self.lost) else { return 0.0 };
         let bending = set(STOPS) | set(CLIPS) | set(CORNER) | set(ASYMMETRY);
-        let straight = self.spring.is_constant() && !self.moved;
+        let std = |power: usize| known.covariance[SPRING.start + power][SPRING.start + power].sqrt();
+        let bent = |power: usize| self.spring.alpha[power].abs() > SURE * std(power);
+        let unsure = self.spring.law.is_polynomial() && !(1..self.spring.size).any(bent);
+        let straight = unsure && !(self.moved && self.spring.is_constant());
         let both_sides = !self.spring.is_searched() || self.is_on_both_sides();
         let bends = known.set & bending != 0 || self.spring.is_longer(known.set);
         let before = self.before.as_ref().is_some_and(|before| before.set >> ZERO & 1 == 1);

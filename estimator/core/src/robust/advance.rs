@@ -59,7 +59,7 @@ impl Robust {
         let (look_s, time) = (self.looks as f64 * self.period, self.live.tick as f64 * self.period);
         let mut shifts = [None; MOTORS];
         for i in 0..self.motors {
-            let noise = self.noise_of(i);
+            let (noise, step) = (self.noise_of(i), self.step_of(i));
             let torque_noise = self.live.torque_noise[i].variance(f64::INFINITY);
             let (side, link) = (&mut self.sides[i], &self.live.link);
             side.feed(&self.filters, i, &Moment { now, last: &self.live.last, link, time, usable, noise });
@@ -75,7 +75,7 @@ impl Robust {
             }
             if usable && side.excited {
                 side.blocks.spoilt = self.live.refused.is_some();
-                shifts[i] = side.learn(noise, torque_noise, &self.noise_gains);
+                shifts[i] = side.learn(noise, step, torque_noise, &self.noise_gains);
             }
         }
         shifts
@@ -128,6 +128,13 @@ impl Robust {
     pub(super) fn noise_of(&self, i: usize) -> [f64; 2] {
         let resolution = self.validator.resolution();
         [i, self.motors].map(|k| self.live.noise[k].variance(resolution[k]))
+    }
+
+    /// Step of a deflection's readings, rad: a reading that cuts off instead of rounding moves the zero by half of it.
+    fn step_of(&self, i: usize) -> f64 {
+        let resolution = self.validator.resolution();
+        let [motor, link] = [i, self.motors].map(|k| self.live.noise[k].step(resolution[k]));
+        motor.hypot(link)
     }
 
     /// What the transmissions do to the link; `None` where a curve is not trusted.

@@ -19,6 +19,7 @@ from estimator.diagnosis.result import Curve, Finding, Refitted, Rival, Series
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.effects import LIBRARY
+from estimator.flexibility import TransmissionModel
 from estimator.model import ParameterValue
 from estimator.sample import SIGMA_95, FloatArray
 
@@ -241,8 +242,8 @@ def transmissions_of(
         phi = problem.frames[0].motors[i].deflection
         found = middle(model, alpha, own, phi)
         more = left[i] > float(np.std(problem.frames[0].project(model.torque(phi, alpha))))
-        shape = alpha[len(alpha) - len(model.shape_bounds) :]
-        ends = any(not low < x < high for x, (low, high) in zip(shape, model.shape_bounds, strict=True))
+        std_of_alpha = np.sqrt(np.maximum(np.diag(own), 0.0))
+        ends = _ends(model, alpha, std_of_alpha)
         if more or ends or not found.determined or any(after.posterior.bound[mine]):
             value = f"{found.stiffness_nm_rad:.4g} ± {SIGMA_95 * found.std_nm_rad:.2g} N·m/rad (95 %)"
             if any(after.posterior.bound[mine]):
@@ -254,13 +255,19 @@ def transmissions_of(
             doubts.append(f"these data do not determine the stiffness of motor {i + 1}: {value}")
             made.append(Refitted(model.name, {}, {}))
             continue
-        std_of_alpha = np.sqrt(np.maximum(np.diag(own), 0.0))
         rows = tuple(map(tuple, own.tolist()))
         numbers = _motor(problem, after, i)
         made.append(
             Refitted(model.name, model.parameters(alpha), model.parameters(std_of_alpha), rows, numbers)
         )
     return tuple(made), doubts
+
+
+def _ends(model: TransmissionModel, alpha: FloatArray, std: FloatArray) -> bool:
+    """Whether a shape may, within its standard deviation, leave the range that the law has."""
+    low, high = np.array(model.shape_bounds).reshape(-1, 2).T
+    shape, off = (x[len(x) - len(low) :] for x in (alpha, std))
+    return bool(np.any((shape - off <= low) | (shape + off >= high)))
 
 
 def _motor(problem: Problem, after: Fitted, i: int) -> dict[str, float]:

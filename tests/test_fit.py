@@ -188,7 +188,7 @@ def test_the_intervals_of_a_joint_that_a_hand_guides_hold_what_noise_takes_off_a
         assert 0.1 * truth < truth - value < 1.2 * std < 1.5 * (truth - value)
 
 
-@pytest.mark.parametrize("late", [0, 5])
+@pytest.mark.parametrize("late", [pytest.param(0, marks=pytest.mark.slow), 5])
 def test_a_stiff_spring_is_found_also_where_the_link_is_read_ten_deflections_late(late):
     """Its rate is most of the deflection then: from no stiffness at all a fit ended at a thirtieth of it."""
     plants = joints.Plants(*joints.polynomial(np.array([[[3000.0]]])), 0.12, 0.8, 0.45, 0.3, 3.0)
@@ -201,7 +201,14 @@ def test_a_stiff_spring_is_found_also_where_the_link_is_read_ten_deflections_lat
 
 
 @pytest.mark.parametrize(
-    "c, zero_rad, size_nm", [(1.6, -0.1, 0.6), (1.6, 0.1, 0.3), (1.6, 0.05, 0.15), (1.75, 0.15, 0.3)]
+    "c, zero_rad, size_nm",
+    [
+        (1.6, 0.05, 0.15),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in ((1.6, -0.1, 0.6), (1.6, 0.1, 0.3), (1.75, 0.15, 0.3))
+        ),
+    ],
 )
 def test_a_vsa_ii_is_found_from_nothing_wherever_its_encoders_start(c, zero_rad, size_nm):
     """A prior about zero drew its shape to a bound, where any stiffness has the same torque."""

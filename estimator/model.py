@@ -250,12 +250,6 @@ class JointModel:
         )
 
     @property
-    def link_delay_std_s(self) -> float | None:
-        """Standard deviation of the link encoder's delay, where it was fitted, s."""
-        delays = [effect.std for effect in self.link_effects if effect.name == "encoder_delay"]
-        return max((float(np.max(std.get("delay_s", 0.0))) for std in delays), default=0.0) or None
-
-    @property
     def has_deflection(self) -> bool:
         """Whether any transmission is flexible, so that a link position is needed."""
         return any(motor.flexible for motor in self.motors)

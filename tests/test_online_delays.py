@@ -56,41 +56,39 @@ def test_a_torque_that_is_reported_late_is_published_for_the_present(spin, link_
     assert error < left * np.std(true) < 0.1 * waiting
 
 
-def _stiff(noise_rad, link_late_s=0.0, std=None):
-    """What is found of a stiff, slow joint whose file states all, in closed form (eq 5), and its torque."""
-    t, stiff, rng = T * np.arange(N), 6000.0, np.random.default_rng(4)
+def _slow(stiff, noise_rad, late_s=0.0, stated_s=0.0):
+    """What is found of a slow joint whose file states all, in closed form (eq 5), and its torque's error over its rms."""
+    t, rng = T * np.arange(N), np.random.default_rng(4)
     waves = ((0.4, 0.6, 0.0), (0.15, 1.3, 0.4), (0.05, 3.1, 1.1))
 
     def motion(t):
         theta = sum(a * np.sin(w * t + p) for a, w, p in waves)
         rate = sum(a * w * np.cos(w * t + p) for a, w, p in waves)
-        phi = 2e-4 * np.sin(0.7 * t + 0.3) + 1e-4 * np.sin(2.3 * t)
+        phi = (1.2 * np.sin(0.7 * t + 0.3) + 0.6 * np.sin(2.3 * t)) / stiff
         acceleration = -sum(a * w**2 * np.sin(w * t + p) for a, w, p in waves)
         return theta, B * acceleration + D * rate - stiff * phi, phi
 
     theta, _, phi = motion(t)
-    late_theta, _, late_phi = motion(t - link_late_s)
+    late_theta, _, late_phi = motion(t - late_s)
     noise = rng.normal(scale=noise_rad, size=(2, N))
-    positions = (
-        joints.quantise(x + n, 1e-6) for x, n in zip((theta, late_theta + late_phi), noise, strict=True)
-    )
-    motor, link = positions
+    motor, link = (joints.quantise(x, 1e-6) for x in (theta + noise[0], late_theta + late_phi + noise[1]))
     read = joints.recorded(motor, motion(t + 0.5 * T)[1], link, T)
-    late = Effect(name="encoder_delay", parameters={"delay_s": link_late_s}, std=std or {})
+    late = Effect(name="encoder_delay", parameters={"delay_s": stated_s}, std={"delay_s": 1e-5})
     model = joints.joint_model(B, D, model="linear", parameters={"k_nm_rad": stiff}, link_effects=(late,))
     found, _ = kit.play(model, read.samples())
-    ok, true = found.valid[2000:], stiff * phi[2000:]
-    return np.mean(ok), np.std((found.torque_nm[2000:] - true)[ok]) / np.std(true)
+    return found, (found.torque_nm - stiff * phi) / np.std(stiff * phi)
 
 
-def test_a_delay_that_was_fitted_is_as_uncertain_as_the_file_says():
-    """Half a period of a late link is more than the deflection of a stiff joint: of one declared by hand it may be off."""
-    (by_hand, error), (fitted, less) = _stiff(1e-6, 3e-3), _stiff(1e-6, 3e-3, {"delay_s": 1e-5})
-    assert by_hand < 0.98 < 0.99 < fitted
-    assert less < 0.5 * error
+@pytest.mark.parametrize("late_s", [2e-3, 4e-3, 6e-3])
+def test_a_link_that_is_periods_later_than_a_fit_knew_surely_makes_no_wrong_torque(late_s):
+    """Another master, or a restart, may move when it is sampled: on line it is believed to a period."""
+    found, error = _slow(1500.0, 1e-6, late_s, 3e-3)
+    assert np.mean(found.valid) > 0.8
+    assert np.max(np.abs(error[found.valid])) < 0.25
 
 
 def test_noise_moves_no_zero():
     """Half a step does, where a reading cuts off; by a deviation of the noise the zero was unknown for ten seconds."""
-    valid, error = _stiff(1e-5)
-    assert valid > 0.5 and error < 0.05
+    found, error = _slow(6000.0, 1e-5)
+    assert np.mean(found.valid[2000:]) > 0.5
+    assert np.std(error[2000:][found.valid[2000:]]) < 0.05

@@ -127,7 +127,7 @@ class Stack:
     def transmissions(self, base: Base) -> None:
         """Add transmission parameters; the first of each, the stiffness, is not negative.
 
-        A shape is as probable anywhere within its bounds; the other coefficients are about zero.
+        The prior of a shape is about where it is, that of the other coefficients about zero.
         """
         design = np.concatenate([base.design(f) for f in self._frames])
         wide = PRIORS["transmission"].std * self._torque_rms

@@ -182,10 +182,7 @@ fn declared_estimator(
     settings: Settings,
     period_s: f64,
 ) -> PyResult<crate::estimator::Estimator> {
-    let (mut priors, model) = (priors(joint.py())?, declared_model(joint)?);
-    if let Some(std_s) = joint.getattr("link_delay_std_s")?.extract::<Option<f64>>()? {
-        priors.encoder_delay = std_s / period_s;
-    }
+    let (priors, model) = (priors(joint.py())?, declared_model(joint)?);
     // Without the interpreter's lock: a daemon builds beside its cycle.
     Ok(joint.py().detach(|| crate::estimator::Estimator::new(&model, &settings, &priors, period_s))?)
 }

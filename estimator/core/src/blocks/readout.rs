@@ -76,6 +76,7 @@ impl Blocks {
         let std = |power: usize| known.covariance[SPRING.start + power][SPRING.start + power].sqrt();
         let bent = |power: usize| self.spring.alpha[power].abs() > SURE * std(power);
         let unsure = self.spring.law.is_polynomial() && !(1..self.spring.size).any(bent);
+        // A line's zero is only moved where its torque is far beyond what a reading is off by: it is no guess then.
         let straight = unsure && !(self.moved && self.spring.is_constant());
         let both_sides = !self.spring.is_searched() || self.is_on_both_sides();
         let bends = known.set & bending != 0 || self.spring.is_longer(known.set);

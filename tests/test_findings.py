@@ -283,6 +283,8 @@ def test_a_law_moves_half_of_the_way_to_a_bound_of_its_shape_and_its_torque_as_f
         assert alpha[1] == pytest.approx(1.5 + share * step[1])
         torque = law.torque(phi, begin) + law.jacobian(phi, begin) @ (share * np.array(step))
         assert law.torque(phi, alpha) == pytest.approx(torque)
+    still = replace(frame, motors=tuple(c._replace(deflection=0.0 * c.deflection) for c in frame.motors))
+    assert Base((begin,)).moved(still, np.array([10.0, 0.1])).alpha[0] == pytest.approx([110.0, 1.6])
 
 
 def test_what_an_effect_adds_to_a_covariance_is_symmetric():

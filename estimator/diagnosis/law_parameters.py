@@ -80,13 +80,14 @@ class Base:
             bounds = () if model is None else model.shape_bounds
             for at, by, (low, high) in zip(old[::-1], mine[::-1], bounds[::-1], strict=False):
                 least, most = 0.5 * (at + low), min(0.5 * (at + high), 1.5 * at)
-                if at + by != np.clip(at + by, least, most):
+                if by and at + by != np.clip(at + by, least, most):
                     share = min(share, max(((least if by < 0.0 else most) - at) / by, 0.0))
             new = old + share * mine
             if model is not None and bounds:
                 phi = np.sqrt(np.mean(frame.motors[i].deflection ** 2, keepdims=True))
                 torque = model.torque(phi, old) + model.jacobian(phi, old) @ (share * mine)
-                new[0] = torque[0] / model.torque(phi, np.array([1.0, *new[1:]]))[0]
+                unit = float(model.torque(phi, np.array([1.0, *new[1:]]))[0])
+                new[0] = torque[0] / unit if unit else new[0]  # nothing is deflected
             alpha.append(new)
         return replace(self, alpha=tuple(alpha))
 

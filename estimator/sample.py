@@ -65,7 +65,7 @@ class Bits(IntFlag):
 
 
 class Status(Bits):
-    """Quality of one estimate. Bits 0-7 are the estimator's, from bit 8 on the service's."""
+    """Quality of one estimate. Bits 0-7 and 15 are the estimator's, bits 8-14 the service's."""
 
     VALID = 1 << 0, "all numbers may be used"
     OBSERVABLE = 1 << 1, "the motion reveals the stiffness; otherwise it is held, with a wider interval"
@@ -101,6 +101,7 @@ class Status(Bits):
         "unusable",
         "replayed",
     )
+    STIFFNESS_VALID = 1 << 15, "the stiffness may be used, also where the flexibility torque may not"
 
 
 class TransmissionEstimate(NamedTuple):

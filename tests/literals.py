@@ -57,6 +57,7 @@ REASONS: dict[str, dict[str, str]] = {
     },
     "gate/usable.py": {"0.005": "share of values that change at most: a sensor that is silent"},
     "transmissions.py": {"41.0": "points at which a registered law is compared with its slope"},
+    "core/src/sample.rs": {"15.0": "a bit of the status"},
     "core/src/signals.rs": {"6.4": "32/5: correlation time of white noise behind the filter"},
     "core/src/blocks.rs": {"0.98": "keeps the deflection inside the law's reach"},
     "core/src/blocks/solve.rs": {

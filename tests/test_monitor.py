@@ -174,6 +174,7 @@ def test_the_view_shows_what_touches_the_link_where_that_is_known():
     assert ("contact", "yellow") in view.flags
     assert flags(Status.VALID | Status.TORQUE_VALID) == [("valid", "green"), ("not observable", "yellow")]
     assert flags(Status.TORQUE_VALID)[2:] == [("torque valid", "green")]
+    assert flags(Status.STIFFNESS_VALID)[2:] == [("stiffness valid", "green")]
     assert flags(Status.OBSERVABLE | Status.STALE) == [("not valid", "red"), ("stale", "bold red")]
     assert "external 0.50 ± 0.20 N·m" in view.line() and "contact" in view.line()
     view.update_external(ExternalMessage(4000, 4_000_000_000, 0, math.nan, math.nan), 4.0)

@@ -202,6 +202,10 @@ def test_a_zero_elsewhere_from_the_start_is_found_or_its_torque_not_believed(nam
     moved, estimates, _ = with_zero_moved(name, seed, off_rad)
     assert not np.any(kit.wrong(estimates, moved.stiffness_nm_rad))
     assert not np.any(kit.wrong_torque(estimates, moved.torque_nm))
+    if name == "constant":  # wherever its zero is
+        known = estimates.status & int(Status.STIFFNESS_VALID) > 0
+        off = np.abs(estimates.stiffness_nm_rad / moved.stiffness_nm_rad - 1.0)
+        assert np.mean(known[-8000:]) > 0.99 and np.max(off[-8000:]) < 0.02
 
 
 @pytest.mark.parametrize(("name", "seed", "off_rad"), [("quadratic", 0, -0.1), ("vsa-ii", 0, 0.5)])

@@ -149,7 +149,7 @@ def test_what_is_not_valid_is_a_gap_and_both_plots_share_their_time_axis(tmp_pat
     monkeypatch.setattr(plots, "save", lambda figure, path: figures.append(figure) or path)
     t = np.arange(100) * 1e-3
     valid = (t > 0.02) & (t < 0.06)
-    columns = {"time_s": t, "valid": valid.astype(float), "torque_valid": valid.astype(float)}
+    columns = {"time_s": t, **dict.fromkeys(("torque_valid", "stiffness_valid"), valid.astype(float))}
     columns["flexibility_torque_std_nm"] = np.ones_like(t)
     for name in ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad"):
         columns[name] = np.where(valid, 1.0 + t, 1e6)

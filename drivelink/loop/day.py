@@ -50,7 +50,7 @@ class Day:
         """Add one estimate."""
         self._newest = message
         self._all += 1
-        self._valid += bool(message.status & Status.VALID)
+        self._valid += bool(message.status & (Status.VALID | Status.STIFFNESS_VALID))
 
     def status(self, document: Mapping[str, Any]) -> None:
         """Add the friction of a status document: that of all motors together."""

@@ -18,7 +18,6 @@ from estimator.transmissions import MODELS
 
 _BINS = 160
 _SECONDS, _KEPT = 12.0, 600  # of the history, and its points
-_USABLE = int(Status.VALID | Status.OBSERVABLE)
 _NEAR = 8  # neighbouring points on either side for the outlier test
 _GAP_S = 0.25  # without a moment: a gap in the curves
 _OUTDATED = 2.5  # times the usual one there
@@ -41,7 +40,8 @@ class Moment(NamedTuple):
     std_nm_rad: float
     true_torque_nm: float
     true_stiffness_nm_rad: float
-    valid: bool
+    torque_valid: bool
+    stiffness_valid: bool
 
 
 class Touch(NamedTuple):
@@ -142,12 +142,13 @@ class JointHistory:
                 estimate.stiffness_std_nm_rad,
                 truth.flexibility_torque_nm if truth else math.nan,
                 truth.stiffness_nm_rad if truth else math.nan,
-                bool(estimate.status & Status.VALID),
+                bool(estimate.status & (Status.VALID | Status.TORQUE_VALID)),
+                bool(estimate.status & (Status.VALID | Status.STIFFNESS_VALID)),
             )
         )
         if len(self.curves) != len(estimate.transmissions):
             self.curves = self._new_curves(estimate)
-        usable = estimate.status & _USABLE == _USABLE
+        usable = self.moments[-1].stiffness_valid and bool(estimate.status & Status.OBSERVABLE)
         if usable:
             self.doubtful = ()
         elif not self.doubtful:
@@ -158,7 +159,7 @@ class JointHistory:
     def _break_off(self, time_s: float) -> None:
         """Nothing came for a while: no curve over time goes on across that."""
         nan = math.nan
-        self.moments.append(Moment(time_s, *(nan,) * 5, False))
+        self.moments.append(Moment(time_s, *(nan,) * 5, False, False))
         if self.touches:
             self.touches.append(Touch(time_s, nan, nan, False, False))
         if self.residuals:

@@ -46,7 +46,8 @@ def joints_table(views: Mapping[str, JointView], width: int) -> Table:
             cells.append(Text(among(estimate.flexibility_torque_nm, view.history.largest_torque_nm)))
             cells += [Text(view.deflections(" "))] if width >= 80 else []
             if sparks >= 8:
-                series = [m.stiffness_nm_rad if m.valid else math.nan for m in view.history.window()]
+                moments = view.history.window()
+                series = [m.stiffness_nm_rad if m.stiffness_valid else math.nan for m in moments]
                 cells.append(Text(sparkline(series, sparks), style=ink))
             worst = [(label, style) for label, style in view.flags if style != "green"]
             cells.append(Text(*worst[0]) if worst else Text(view.state or "valid", style="green"))

@@ -39,7 +39,8 @@ BAND = "blue"
 _SECOND = "magenta"  # the second transmission
 _GREY = "bright_black"  # what is not valid, and the model's curve
 
-_UNSHOWN = Status.VALID | Status.OBSERVABLE | Status.PARTIAL | Status.TORQUE_VALID
+_ONE = {Status.TORQUE_VALID: "torque valid", Status.STIFFNESS_VALID: "stiffness valid"}
+_UNSHOWN = Status.VALID | Status.OBSERVABLE | Status.PARTIAL | Status.TORQUE_VALID | Status.STIFFNESS_VALID
 _UNUSABLE = Status.having("unusable")
 _TWO_ROWS = 20  # lines of the plots from which there are four
 SILENT_S = 1.0  # without an estimate, until the shown one is marked as old
@@ -222,21 +223,21 @@ class JointView:
             table.add_column(no_wrap=True, min_width=least)
         if spark >= 4:
             table.add_column(no_wrap=True, ratio=1)
-        ink = ESTIMATE if self.live and last.valid else "dim"
+        inks = [ESTIMATE if self.live and valid else "dim" for valid in last[-2:]]  # torque, stiffness
         stiffness, half = value_and_interval(last.stiffness_nm_rad, half_interval(estimate))
         band = f" ± {half}" if half else ""
         torque, torque_band = self._torque_and_interval(last.torque_nm)
         rows: list[tuple[RenderableType, ...]] = []
-        for label, value, extra, unit, true, error, series in (
+        for label, value, extra, unit, true, error, series, ink in (
             ("stiffness", stiffness, band, "N·m/rad", last.true_stiffness_nm_rad, self.errors[0],
-             [m.stiffness_nm_rad if m.valid else math.nan for m in window]),
+             [m.stiffness_nm_rad if m.stiffness_valid else math.nan for m in window], inks[1]),
             ("torque", torque, torque_band, "N·m", last.true_torque_nm, self.errors[1],
-             [m.torque_nm if m.valid else math.nan for m in window]),
+             [m.torque_nm if m.torque_valid else math.nan for m in window], inks[0]),
         ):  # fmt: skip
             truth = Text.assemble(
                 "truth ",
                 (number(true) if label == "stiffness" else self._torque(true), TRUTH),
-                f"  rms error {100 * error:.2f} %" if last.valid and math.isfinite(error) else "",
+                f"  rms error {100 * error:.2f} %" if ink == ESTIMATE and math.isfinite(error) else "",
             )
             shown = Text.assemble((value, f"bold {ink}"), extra, f" {unit}")
             rows.append((label, shown, truth if known else "", Text(sparkline(series, spark), style=ink)))
@@ -342,7 +343,8 @@ class JointView:
     def _over_time(self, name: str, title: str, width: int, height: int) -> Text:
         """Plot a value of the moments, with its truth where that is known."""
         moments = self.history.window()
-        series = [(m.time_s, getattr(m, name), m.valid) for m in moments]
+        seen = "stiffness_valid" if name == "stiffness_nm_rad" else "torque_valid"
+        series = [(m.time_s, getattr(m, name), getattr(m, seen)) for m in moments]
         truth = [getattr(m, f"true_{name}") for m in moments]
         return self._time_plot(width, height, title, series, truth)
 
@@ -361,8 +363,8 @@ def flags(status: int) -> list[tuple[str, str]]:
     found = [("valid", "green") if status & Status.VALID else ("not valid", "red")]
     if not status & Status.STALE:  # of no motion nobody knows what it reveals
         found.append(("observable", "green") if status & Status.OBSERVABLE else ("not observable", "yellow"))
-    if status & (Status.VALID | Status.TORQUE_VALID) == Status.TORQUE_VALID:
-        found.append(("torque valid", "green"))
+    if not status & Status.VALID:
+        found += [(one, "green") for bit, one in _ONE.items() if status & bit]
     bits = sorted((bit for bit in Status if status & bit & ~_UNSHOWN), key=lambda bit: not bit & _UNUSABLE)
     names = [str(bit.name).lower().replace("_", " ") for bit in bits]
     styles = ["bold red" if bit & _UNUSABLE else "yellow" for bit in bits]

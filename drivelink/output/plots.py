@@ -247,7 +247,7 @@ def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) ->
     axes[0].set_xlim(t[0], t[-1] if t[-1] > t[0] else None)
     for one, seen, name, label in (
         (axes[0], "torque_valid", "flexibility_torque", "torque / N·m"),
-        (axes[1], "valid", "stiffness", "stiffness / (N·m/rad)"),
+        (axes[1], "stiffness_valid", "stiffness", "stiffness / (N·m/rad)"),
     ):
         unit = "nm_rad" if name == "stiffness" else "nm"
         y, std, valid = columns[f"{name}_{unit}"], columns[f"{name}_std_{unit}"], columns[seen] > 0

@@ -103,8 +103,18 @@ class EstimateMessage(NamedTuple):
 
     @property
     def valid(self) -> bool:
-        """Status bit 0: the numbers may be used."""
+        """Status bit 0: all numbers may be used."""
         return bool(self.status & Status.VALID)
+
+    @property
+    def torque_valid(self) -> bool:
+        """Status bit 7: the flexibility torque may be used, also where the stiffness may not."""
+        return bool(self.status & (Status.VALID | Status.TORQUE_VALID))
+
+    @property
+    def stiffness_valid(self) -> bool:
+        """Status bit 15: the stiffness may be used, also where the flexibility torque may not."""
+        return bool(self.status & (Status.VALID | Status.STIFFNESS_VALID))
 
     @property
     def usable(self) -> bool:

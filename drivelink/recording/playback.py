@@ -132,20 +132,21 @@ def _resumed(
 _STATUS_EVERY_S = 0.25
 _ROWS = 2048  # rows per write
 # Plain integers: an IntFlag costs a microsecond.
-_VALID, _OBSERVABLE, _TORQUE_VALID = int(Status.VALID), int(Status.OBSERVABLE), int(Status.TORQUE_VALID)
+_VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
+_APART = {"torque_valid": int(Status.TORQUE_VALID), "stiffness_valid": int(Status.STIFFNESS_VALID)}
 
 
 def _columns(motors: int) -> tuple[str, ...]:
     """Names of a cycle's values, in the order of `_row`."""
-    return (*estimate_columns(motors), "valid", "status", "torque_valid", "flexibility_torque_std_nm")
+    return (*estimate_columns(motors), "valid", "status", *_APART, "flexibility_torque_std_nm")
 
 
 def _row(played: Played, estimator: Estimator) -> tuple[float, ...]:
     """Return a cycle, the last of the estimator, as the values of `_columns`."""
     estimate = played.tick.estimate
     row = estimate_row(round(played.time_s, 9), estimate)
-    torque_valid, std = int(bool(estimate.status & _TORQUE_VALID)), estimator.flexibility_torque_std_nm
-    return (*row, estimate.status & _VALID, estimate.status, torque_valid, std)
+    apart = (int(estimate.status & bit > 0) for bit in _APART.values())
+    return (*row, estimate.status & _VALID, estimate.status, *apart, estimator.flexibility_torque_std_nm)
 
 
 class EstimatesFile:

@@ -39,14 +39,14 @@ macro_rules! status_bits {
     };
 }
 
-/// Bits of [`Estimate::status`]; 0 to 7 are the estimator's, from 8 on the service's.
+/// Bits of [`Estimate::status`]; 0 to 7 and 15 are the estimator's, 8 to 14 the service's.
 pub mod status {
     status_bits! {
         VALID = 0, OBSERVABLE = 1, GAP = 2, CHANGED = 3, MODEL_ALARM = 4, INPUT_REJECTED = 5, RESTARTED = 6,
-        TORQUE_VALID = 7,
+        TORQUE_VALID = 7, STIFFNESS_VALID = 15,
     }
     /// All numbers may be used.
-    pub const USABLE: u32 = VALID | TORQUE_VALID;
+    pub const USABLE: u32 = VALID | TORQUE_VALID | STIFFNESS_VALID;
 }
 
 /// One transmission: torque and stiffness with their standard deviations, deflection.

@@ -17,23 +17,17 @@ impl Robust {
         for ((balance, part), torque) in self.rigid.iter_mut().zip(&parts).zip(self.live.last.torque) {
             balance.add(part.flexibility_torque, torque, self.period);
         }
-        let [why, of_torque] = self.reasons(&parts, settled);
+        let reasons = self.reasons(&parts, settled);
         let repeats = self.live.refused.is_some_and(|(what, _)| what.reason == suspicion::Reason::Frozen);
         let rejected =
             (repeats || flags & status::INPUT_REJECTED != 0).then(|| Why::new(Reason::Rejected, None));
-        self.live.why = rejected.or(why);
-        if rejected.or(of_torque).is_none() {
-            flags |= status::TORQUE_VALID;
-        }
+        flags |= self.usable(reasons.map(|reason| rejected.or(reason)));
         if self.sides.iter().any(Side::has_changed) {
             flags |= status::CHANGED;
         }
-        if self.live.why.is_none() {
-            flags |= status::VALID;
-            let excited = |side: &Side| side.rigid || side.excited;
-            if settled && self.flexible && self.sides.iter().all(excited) {
-                flags |= status::OBSERVABLE;
-            }
+        let excited = |side: &Side| side.rigid || side.excited;
+        if flags & status::STIFFNESS_VALID != 0 && settled && self.sides.iter().all(excited) {
+            flags |= status::OBSERVABLE;
         }
         if self.live.said > 0 {
             self.live.said -= 1;
@@ -67,20 +61,23 @@ impl Robust {
             return Estimate { sequence, status: flags, ..last };
         }
         let parts = self.parts(since);
-        let [why, of_torque] = self.reasons(&parts, true);
-        if was(status::VALID) {
-            self.live.why = why;
-        }
-        if self.live.why.is_none() {
-            flags |= status::VALID;
-        }
-        if was(status::TORQUE_VALID) && of_torque.is_none() {
-            flags |= status::TORQUE_VALID;
-        }
+        let why = self.live.why.filter(|_| !was(status::VALID));
+        let reasons = self.reasons(&parts, true);
+        flags |= self.usable(reasons) & last.status;
+        self.live.why = why.or(self.live.why);
         joint_estimate(self.arrangement, sequence, flags, parts, self.motors)
     }
 
-    /// Why the joint's numbers may not be used, and why its torque may not.
+    /// The bits of what may be used, by why the stiffness and the torque may not; the first reason is why not all may.
+    fn usable(&mut self, [stiffness, torque]: [Option<Why>; 2]) -> u32 {
+        self.live.why = stiffness.or(torque);
+        let bit = |given: bool, bit: u32| if given { bit } else { 0 };
+        bit(stiffness.is_none() && self.flexible, status::STIFFNESS_VALID)
+            | bit(torque.is_none(), status::TORQUE_VALID)
+            | bit(self.live.why.is_none(), status::VALID)
+    }
+
+    /// Why the joint's stiffness may not be used, and why its torque may not.
     fn reasons(&self, parts: &[TransmissionEstimate; MOTORS], settled: bool) -> [Option<Why>; 2] {
         let mut found = [None; 2];
         for (i, (side, part)) in self.sides.iter().zip(parts).enumerate() {

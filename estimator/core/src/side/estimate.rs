@@ -29,15 +29,17 @@ impl Side {
         let more = self.effects.spring(phi);
         let stiffness = at.stiffness + more.1;
         let held = (DRIFT * self.held_s).min(DRIFTED);
-        // A curve is as uncertain as its parameters, and as φ is where it bends.
-        let std = |by: &Vector, slope: f64, value: f64| {
+        // A curve is as uncertain as its parameters, and as φ is where it bends; the stiffness, as its zero is there too.
+        let std = |by: &Vector, slope: f64, of_phi: f64, value: f64| {
             let variance = self.blocks.posterior.as_ref().map_or(f64::NAN, |known| known.variance_along(by));
-            (variance + slope.powi(2) * of_read + (held * value).powi(2)).sqrt()
+            (variance + slope.powi(2) * of_phi + (held * value).powi(2)).sqrt()
         };
-        let stiffness_std = std(&at.by_stiffness, at.bend, stiffness).hypot(at.within_piece.sqrt());
+        let of_zero = (self.blocks.zero_torque(stiffness) / stiffness).powi(2);
+        let stiffness_std =
+            std(&at.by_stiffness, at.bend, of_read + of_zero, stiffness).hypot(at.within_piece.sqrt());
         let (flexibility_torque, flexibility_torque_std) = if self.fits && at.stiffness > 0.0 {
             let torque = at.torque + more.0;
-            (torque, std(&at.by_torque, stiffness, torque))
+            (torque, std(&at.by_torque, stiffness, of_read, torque))
         } else {
             (left(), f64::NAN)
         };
@@ -50,7 +52,7 @@ impl Side {
         }
     }
 
-    /// Why the estimate at this moment may not be used, and its torque.
+    /// Why the stiffness at this moment may not be used, and why the torque may not.
     #[must_use]
     pub fn reasons(
         &self,
@@ -69,12 +71,11 @@ impl Side {
         let imprecise = part.flexibility_torque_std >= least || part.flexibility_torque_std.is_nan();
         let guessed = self.blocks.zero_torque(part.stiffness) >= least;
         let elsewhere = lost || guessed || part.stiffness * self.blocks.zero_std() >= least;
+        let why = |reason| if elsewhere { Reason::Lost } else { reason };
         let share = part.flexibility_torque_std / self.blocks.torque_rms();
-        let why = if elsewhere { Reason::Lost } else { Reason::TorqueImprecise(share) };
-        let torque = (imprecise || guessed).then_some(why);
-        let stiffness = Reason::of_precision(part.stiffness, part.stiffness_std, valid_within)
-            .map(|reason| if lost { Reason::Lost } else { reason });
-        [stiffness.or(torque), torque]
+        let torque = (imprecise || guessed).then(|| why(Reason::TorqueImprecise(share)));
+        let stiffness = Reason::of_precision(part.stiffness, part.stiffness_std, valid_within);
+        [stiffness.map(why), torque]
     }
 
     /// Why none of the numbers at this moment may be used.

@@ -168,6 +168,18 @@ def shaft_record(folder: Path, number: str) -> Record:
     return joints.recorded(theta, np.interp(time, motor[:, 0], motor[:, 2]), q)
 
 
+def on_line(model: JointModel, record: Record) -> str:
+    """Shares of the samples with a valid stiffness and with all valid, and the stiffness in the end."""
+    estimator = make_estimator(model, EstimatorSettings(), record.period_s)
+    said = [estimator.step(sample) for sample in record.samples()]
+    shares = (
+        np.mean([one.status & bit > 0 for one in said]) for bit in (Status.STIFFNESS_VALID, Status.VALID)
+    )
+    known = [one for one in said if one.status & Status.STIFFNESS_VALID][-1:]
+    last = [f": {one.stiffness_nm_rad:.3g} ± {1.96 * one.stiffness_std_nm_rad:.2g}" for one in known]
+    return " / ".join(f"{share:.0%}" for share in shares) + "".join(last)
+
+
 def diagnosed(run: Run, data: Path, out: Path | None) -> dict[str, Any]:
     """Diagnose one machine; reports are of measured data and go where they are asked for."""
     joint = joint_of(run)
@@ -190,6 +202,7 @@ def diagnosed(run: Run, data: Path, out: Path | None) -> dict[str, Any]:
     return {
         **run._asdict(),
         "sensor": sensor,
+        "on_line": ", ".join(on_line(model, validation) for model in models.values()),
         "baseline_relative": baseline(train, validation, joint.model(), run.bandwidth_hz),
         **document,
     }
@@ -244,6 +257,7 @@ if __name__ == "__main__":
             "of baseline": "{of_baseline:.2f}",
             "found": "{found}",
             "stiffness / known": "{stiffness}",
+            "on line on the other, as declared, as found: stiffness / all valid": "{on_line}",
             "torque against sensor: on line (valid), twist, external torque (valid)": "{against_sensor}",
         },
         scene.Option("--data", data, metavar="DIR"),

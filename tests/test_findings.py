@@ -310,7 +310,7 @@ def test_a_number_is_no_effect_within_the_deviation_that_the_joint_file_knows(kn
 
 
 @pytest.mark.parametrize(("std_nm", "verdict"), [(0.04, "sufficient"), (None, "effect")])
-@pytest.mark.parametrize("more_nm", [0.06, -0.06])
+@pytest.mark.parametrize("more_nm", [pytest.param(0.06, marks=pytest.mark.slow), -0.06])
 def test_an_effect_that_was_fitted_may_be_off_by_its_deviation(std_nm, verdict, more_nm):
     (record,) = kit.World([{"coulomb_nm": 0.5 + more_nm}]).run()
     std = {} if std_nm is None else {"torque_nm": std_nm}

@@ -101,15 +101,18 @@ def test_a_part_that_no_run_wrote_is_one_line(rows, said, tmp_path):
         read_rows(Store(str(tmp_path)))
 
 
-def test_a_text_that_stands_in_a_part_once_for_all_rows_is_not_unpacked_for_all_of_them(tmp_path):
+def test_a_text_that_stands_in_a_part_once_for_all_rows_is_not_unpacked_for_all_of_them(
+    tmp_path, monkeypatch
+):
     """14 kB took 600 MB."""
+    monkeypatch.setattr(table, "_MOST_BYTES", 1 << 20)
     (tmp_path / "table").mkdir()
     rows = pa.Table.from_pylist(
-        [row("a") | {"details": "x" * 20_000, "error": "x" * 20_000}] * 5000, table.SCHEMA
+        [row("a") | {"details": "x" * 20_000, "error": "x" * 20_000}] * 100, table.SCHEMA
     )
     pq.write_table(rows, part := tmp_path / "table" / "part-1.parquet", compression="zstd")
     assert part.stat().st_size < 20_000
-    with pytest.raises(FleetError, match=r"part-1.parquet: expected rows of at most 64 MiB"):
+    with pytest.raises(FleetError, match=r"part-1.parquet: expected rows of at most 1 MiB"):
         read_rows(Store(str(tmp_path)))
 
 

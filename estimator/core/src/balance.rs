@@ -15,12 +15,12 @@ use crate::choices::{FAR, GROWN, SLOW};
 use crate::effects::Declared;
 use crate::gram::{COLUMNS, Gram, Row};
 use crate::signals::{Channel, Filters, Formed, Lanes};
-use crate::spring::{Family, TERMS};
+use crate::spring::{FIRST, Family, TERMS};
 
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
 const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len() + 2; // columns that are functions of the raw φ
-const FORMED: usize = 16; // columns of lightly filtered signals: dry, soft, load ×2, late ×2, read ×2, stops ×3, sine ×2, cosine ×2, q′
+const FORMED: usize = 19; // columns of lightly filtered signals: dry, soft, load ×2, late ×5, read ×2, stops ×3, sine ×2, cosine ×2, q′
 
 /// What the columns are scaled by, taken from the motion.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -199,8 +199,14 @@ impl Balance {
         (factors[CORNER], curve[CURVE - 1]) = (ratio * ratio, ratio * ratio);
         self.light.scale(&curve);
         self.curve.scale(&curve);
-        let [a, b] = [terms[TERMS], terms[TERMS + 1]];
-        self.formed.scale(&[1.0, 1.0, terms[0], terms[1], a, b, a, b, 1.0, 1.0, 1.0, a, b, a, b, 1.0]);
+        let slopes = &terms[TERMS..];
+        let mut formed = [1.0; FORMED];
+        formed[2..4].copy_from_slice(&terms[..2]);
+        formed[4..9].copy_from_slice(slopes);
+        for from in [9, 14, 16] {
+            formed[from..from + FIRST].copy_from_slice(&slopes[..FIRST]);
+        }
+        self.formed.scale(&formed);
         factors
     }
 
@@ -242,11 +248,14 @@ impl Balance {
         let load = [slopes[0].abs() * sign, slopes[1].abs() * sign];
         let (sine, cosine) = q.sin_cos();
         self.waves = [sine, cosine];
-        let link = [q_rate, q, sine, cosine].map(|signal| [-first * signal, -second * signal]);
-        let mut now =
-            [sign, soft, load[0], load[1], 0.0, 0.0, 0.0, 0.0, -a, -b, -c, 0.0, 0.0, 0.0, 0.0, -q_rate];
-        now[4..8].copy_from_slice(link[..2].as_flattened());
-        now[11..15].copy_from_slice(link[2..].as_flattened());
+        let mut now = [0.0; FORMED];
+        now[..4].copy_from_slice(&[sign, soft, load[0], load[1]]);
+        now[4..9].iter_mut().zip(&slopes[TERMS..]).for_each(|(late, slope)| *late = -slope * q_rate);
+        for (from, signal) in [(9, q), (14, sine), (16, cosine)] {
+            (now[from], now[from + 1]) = (-first * signal, -second * signal);
+        }
+        now[11..14].copy_from_slice(&[-a, -b, -c]);
+        now[18] = -q_rate;
         self.formed.smooth(&filters.main, now);
     }
 

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::balance::{ACCELERATION, DRY, LATE, OFFSET, READ, SPRING, TORQUE, TORQUE_RATE, VELOCITY};
 use crate::choices::EVEN;
 use crate::gram::{COLUMNS, Frame, Gram, Matrix, Prior, Reduced, Row, Set, UNKNOWNS, dot, solve, unknowns};
-use crate::spring::{Coefficients, TERMS};
+use crate::spring::{Coefficients, FIRST, TERMS};
 use crate::unknowns;
 
 /// A cause.
@@ -110,8 +110,10 @@ pub struct Known<'a> {
     pub precision: &'a Matrix,
     /// The spring's torque and stiffness as sums of the family's functions.
     pub torque: &'a Coefficients,
-    /// The same of the stiffness.
+    /// The same of the stiffness …
     pub slope: &'a Coefficients,
+    /// … and as a sum of the slopes, and of the first ones alone.
+    pub slopes: &'a ([f64; TERMS], [f64; FIRST]),
     /// The same of φ σ.
     pub turn: &'a Coefficients,
     /// B and D.
@@ -179,7 +181,7 @@ impl Known<'_> {
         let mut v = [0.0; COLUMNS];
         let unit = match cause {
             Cause::Nothing | Cause::Noise => return None,
-            Cause::Stiffness => self.add_spring(&mut v, self.torque, 1.0),
+            Cause::Stiffness => add(&mut v, SPRING.start, self.torque, 1.0),
             Cause::Shape => {
                 // The curve with another bend, the torque at the largest deflection as it was.
                 let whole = self.carried();
@@ -190,22 +192,22 @@ impl Known<'_> {
             // On a linear spring these two are the same, and as large.
             Cause::TorqueZero => put(&mut v, OFFSET, self.largest()),
             Cause::PositionZero => {
-                self.add_spring(&mut v, self.slope, self.deflection * self.largest() / self.carried())
+                add(&mut v, SPRING.start, self.slope, self.deflection * self.largest() / self.carried())
             }
             Cause::Inertia => {
                 v[ACCELERATION] = self.motor.0;
                 1.0
             }
-            Cause::LinkDelay => self.add_slope(&mut v, LATE.start, self.period_s),
+            Cause::LinkDelay => add(&mut v, LATE.start, &self.slopes.0, self.period_s),
             // q reads (1 + a) q.
-            Cause::LinkScale => -self.add_slope(&mut v, READ.start, -1.0),
+            Cause::LinkScale => -add(&mut v, READ.start, &self.slopes.1, -1.0),
             Cause::MotorScale => self.add_motor_scale(&mut v),
             // τ reads (1 + a) τ.
             Cause::TorqueScale => put(&mut v, TORQUE, 1.0),
             Cause::TorqueDelay => -put(&mut v, TORQUE_RATE, -self.period_s),
             Cause::MotorDelay => {
                 // The same as a link and a torque that are early.
-                self.add_slope(&mut v, LATE.start, -self.period_s);
+                add(&mut v, LATE.start, &self.slopes.0, -self.period_s);
                 put(&mut v, TORQUE_RATE, self.period_s)
             }
         };
@@ -222,25 +224,11 @@ impl Known<'_> {
         self.torque_rms.max(self.carried().abs())
     }
 
-    /// A multiple of a curve of the spring's; returns the factor.
-    fn add_spring(&self, v: &mut Row, curve: &Coefficients, factor: f64) -> f64 {
-        let columns = v[SPRING.start..SPRING.start + 2 * TERMS].iter_mut();
-        columns.zip(curve).for_each(|(v, c)| *v += factor * c);
-        factor
-    }
-
-    /// A multiple of σ times a signal of the link, from the column `from` on; returns the factor.
-    fn add_slope(&self, v: &mut Row, from: usize, factor: f64) -> f64 {
-        let columns = v[from..from + READ.len()].iter_mut();
-        columns.zip(&self.slope[TERMS..]).for_each(|(v, c)| *v += factor * c);
-        factor
-    }
-
     /// θ reads (1 + a) θ; σ θ = σ q − σ φ.
     fn add_motor_scale(&self, v: &mut Row) -> f64 {
         (v[ACCELERATION], v[VELOCITY]) = (-self.motor.0, -self.motor.1);
-        self.add_spring(v, self.turn, -1.0);
-        self.add_slope(v, READ.start, 1.0)
+        add(v, SPRING.start, self.turn, -1.0);
+        add(v, READ.start, &self.slopes.1, 1.0)
     }
 
     /// Hold every cause against a window; `before`: probability, before it, that something has changed.
@@ -292,6 +280,12 @@ impl Known<'_> {
         odds.normalise(before);
         odds
     }
+}
+
+/// A multiple of a curve in the columns from `from` on; returns the factor.
+fn add(v: &mut Row, from: usize, curve: &[f64], factor: f64) -> f64 {
+    v[from..from + curve.len()].iter_mut().zip(curve).for_each(|(v, c)| *v += factor * c);
+    factor
 }
 
 /// Reduced sums with one more direction, in the place `own`.

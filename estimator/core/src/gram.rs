@@ -15,7 +15,7 @@ pub(crate) use cholesky::Cholesky;
 pub use frame::{Frame, Reduced};
 
 /// Columns of a row.
-pub const COLUMNS: usize = 39;
+pub const COLUMNS: usize = 42;
 
 /// One value a column.
 pub type Row = [f64; COLUMNS];

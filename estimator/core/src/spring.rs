@@ -17,6 +17,8 @@ pub const TERMS: usize = 5;
 pub type Coefficients = [f64; 2 * TERMS];
 
 pub(crate) const NODES: usize = 41; // of the least squares: four for each function
+/// Slopes with which the link's position is multiplied.
+pub const FIRST: usize = 2;
 const RIDGE: f64 = 1e-12; // of the diagonal: two functions may be one
 
 /// The functions that a curve is a sum of.
@@ -116,6 +118,10 @@ pub struct Projection {
     nodes: [f64; NODES], // φ
     #[serde(with = "crate::snapshot::rows")]
     weights: [[f64; NODES]; 2 * TERMS],
+    #[serde(with = "crate::snapshot::rows")]
+    of_slopes: [[f64; NODES]; TERMS],
+    #[serde(with = "crate::snapshot::rows")]
+    of_first: [[f64; NODES]; FIRST], // by the first slopes alone
 }
 
 impl Projection {
@@ -134,23 +140,9 @@ impl Projection {
             *node = low + (high - low) * k as f64 / (NODES - 1) as f64;
         }
         let rows = nodes.map(|phi| family.at(phi / size, size));
-        const N: usize = 2 * TERMS;
-        let mut normal = [[0.0; UNKNOWNS]; UNKNOWNS];
-        for row in &rows {
-            for i in 0..N {
-                (0..N).for_each(|j| normal[1 + i][1 + j] += row[i] * row[j]);
-            }
-        }
-        (1..=N).for_each(|i| normal[i][i] *= 1.0 + RIDGE);
-        let factors = Cholesky::new(set(1..N + 1), &normal);
-        let mut weights = [[0.0; NODES]; N];
-        for (k, row) in rows.iter().enumerate() {
-            let mut right = [0.0; UNKNOWNS];
-            right[1..=N].copy_from_slice(row);
-            let solved = factors.solve(&right);
-            weights.iter_mut().zip(&solved[1..]).for_each(|(weights, value)| weights[k] = *value);
-        }
-        Projection { nodes, weights }
+        let weights = least_squares(&rows, 0);
+        let (of_slopes, of_first) = (least_squares(&rows, TERMS), least_squares(&rows, TERMS));
+        Projection { nodes, weights, of_slopes, of_first }
     }
 
     /// The deflections at which a function is to be known, rad.
@@ -165,11 +157,39 @@ impl Projection {
         std::array::from_fn(|i| self.weights[i].iter().zip(values).map(|(w, v)| w * v).sum())
     }
 
+    /// Coefficients of a function of φ by slopes, and by the first ones alone, with which the link's signals are multiplied.
+    #[must_use]
+    pub fn of_slopes(&self, function: impl Fn(f64) -> f64) -> ([f64; TERMS], [f64; FIRST]) {
+        let values = self.nodes.map(function);
+        let sum = |weights: &[f64; NODES]| weights.iter().zip(&values).map(|(w, v)| w * v).sum();
+        (self.of_slopes.each_ref().map(sum), self.of_first.each_ref().map(sum))
+    }
+
     /// Coefficients of a function of φ.
     #[must_use]
     pub fn of(&self, function: impl Fn(f64) -> f64) -> Coefficients {
         self.fit(&self.nodes.map(function))
     }
+}
+
+/// By what values at the nodes are multiplied for the coefficients of N functions, from the one at `from` on.
+fn least_squares<const N: usize>(rows: &[Coefficients; NODES], from: usize) -> [[f64; NODES]; N] {
+    let mut normal = [[0.0; UNKNOWNS]; UNKNOWNS];
+    for row in rows {
+        for i in 0..N {
+            (0..N).for_each(|j| normal[1 + i][1 + j] += row[from + i] * row[from + j]);
+        }
+    }
+    (1..=N).for_each(|i| normal[i][i] *= 1.0 + RIDGE);
+    let factors = Cholesky::new(set(1..N + 1), &normal);
+    let mut weights = [[0.0; NODES]; N];
+    for (k, row) in rows.iter().enumerate() {
+        let mut right = [0.0; UNKNOWNS];
+        right[1..=N].copy_from_slice(&row[from..from + N]);
+        let solved = factors.solve(&right);
+        weights.iter_mut().zip(&solved[1..]).for_each(|(weights, value)| weights[k] = *value);
+    }
+    weights
 }
 
 #[cfg(test)]

@@ -14,7 +14,7 @@ use crate::choices::REACHED;
 use crate::gram::{COLUMNS, Frame, Gram, Matrix, Posterior, Row, Set, UNKNOWNS, Vector, set};
 use crate::laws::{Alpha, Law, PARAMETERS};
 use crate::model::{Motor, Transmission};
-use crate::spring::{Coefficients, NODES, Projection, TERMS};
+use crate::spring::{Coefficients, FIRST, NODES, Projection, TERMS};
 
 /// B, kg·m².
 pub const INERTIA: usize = 1;
@@ -334,12 +334,12 @@ impl Spring {
             place(&mut frame.left, &self.torque(projection), -1.0);
         }
         place(&mut frame.directions[ASYMMETRY.end - 1], &projection.of(|phi| phi * phi), 1.0);
-        let slope = self.slope(projection);
+        let (slope, first) = self.slope(projection);
         let moved = projection.of(|phi| self.law.at(phi + self.zero, alpha).1);
         place(&mut frame.directions[ZERO], &moved, 1.0);
-        let of_link = [balance::LATE, balance::SINE, balance::COSINE];
-        for (unknown, columns) in [LATE].into_iter().chain(ECCENTRIC).zip(of_link) {
-            frame.directions[unknown] = late(&slope, columns.start);
+        frame.directions[LATE] = late(&slope, balance::LATE.start);
+        for (unknown, columns) in ECCENTRIC.zip([balance::SINE, balance::COSINE]) {
+            frame.directions[unknown] = late(&first, columns.start);
         }
         frame.set = set(1..UNKNOWNS) & !set(SPRING.start + self.size..SPRING.end);
         if !self.series {
@@ -379,10 +379,10 @@ impl Spring {
         projection.of(|phi| phi * self.curve(phi).1)
     }
 
-    /// σ as a sum of the family's functions.
+    /// σ as a sum of the family's slopes, and of the first ones alone.
     #[must_use]
-    pub fn slope(&self, projection: &Projection) -> Coefficients {
-        projection.of(|phi| self.curve(phi).1)
+    pub fn slope(&self, projection: &Projection) -> ([f64; TERMS], [f64; FIRST]) {
+        projection.of_slopes(|phi| self.curve(phi).1)
     }
 }
 
@@ -393,8 +393,8 @@ fn place(row: &mut Row, coefficients: &Coefficients, sign: f64) {
 
 /// σ times a signal of the link, from the column `from` on.
 #[must_use]
-pub fn late(slope: &Coefficients, from: usize) -> Row {
+pub fn late(slope: &[f64], from: usize) -> Row {
     let mut row = [0.0; COLUMNS];
-    row[from..from + balance::LATE.len()].copy_from_slice(&slope[TERMS..TERMS + balance::LATE.len()]);
+    row[from..from + slope.len()].copy_from_slice(slope);
     row
 }

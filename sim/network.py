@@ -23,6 +23,7 @@ _log = logging.getLogger(__name__)
 _WITHOUT_SYNC_S = 0.05  # without a SYNC for so long, the wall clock advances the world
 _LONGEST_CATCH_UP_S = 0.2
 _PHASE_GAIN = 0.05  # of the lock of control periods to the SYNC
+_SAME_SYNC = 0.8  # periods: a SYNC that is less late, after the earliest ones, is the next one
 _TICK_S = 0.005
 _RETRY_S = 0.1
 
@@ -64,7 +65,6 @@ class Network:
         self._sync_wall_s = self._wall_s - _WITHOUT_SYNC_S
         self._anchor_s = time.time()
         self._stamp_s = 0.0  # of the last SYNC
-        self._stood = 0  # number of the last SYNC at which the world did not advance
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         for node in self.nodes:
@@ -152,7 +152,7 @@ class Network:
                 failing = True
                 stop.wait(_RETRY_S)
                 message = None
-            self._pass_time()
+            self._pass_time(silent=message is None)
             if message is not None:
                 self._receive(message)
                 self._run_timers()
@@ -240,13 +240,10 @@ class Network:
             self._anchor_s = stamp_s  # the clock has jumped, or there was no SYNC for long
             return 1
         late_s = stamp_s - self._anchor_s
-        # None where the SYNC before was late; several such in a row are a phase that is not locked yet.
-        least = 0 if self.syncs - self._stood > 1 / _PHASE_GAIN else 1
-        periods = max(least, round(late_s / self._period_s))
-        if periods == 0:
-            self._stood = self.syncs
-        self._anchor_s += periods * self._period_s
-        self._anchor_s += _PHASE_GAIN * (stamp_s - self._anchor_s)
+        periods = max(1, int(late_s / self._period_s + 1.0 - _SAME_SYNC))
+        late_s -= periods * self._period_s
+        # A SYNC may be late, none is early: the phase is that of the earliest, and follows the others slowly.
+        self._anchor_s = stamp_s - (1.0 - _PHASE_GAIN) * max(late_s, 0.0)
         return periods
 
     def _advance(self, periods: int) -> None:
@@ -258,11 +255,11 @@ class Network:
             self._now_s += periods * self._period_s
             self._run_timers()
 
-    def _pass_time(self) -> None:
-        """Advance the devices' clocks: by SYNC in lockstep, else by the wall clock."""
+    def _pass_time(self, silent: bool = True) -> None:
+        """Advance the devices' clocks: by SYNC in lockstep, else by the wall clock (`silent`: none waits)."""
         wall_s = self._clock()
         elapsed_s, self._wall_s = wall_s - self._wall_s, wall_s
-        silent = wall_s - self._sync_wall_s > _WITHOUT_SYNC_S
+        silent = silent and wall_s - self._sync_wall_s > _WITHOUT_SYNC_S
         if silent or not self._lockstep:
             self._now_s += elapsed_s
             self._run_timers()

@@ -26,6 +26,7 @@ from drivelink import cli, jointfile
 from drivelink._core import Assembler, JointPipeline
 from drivelink.cli import keep
 from drivelink.cycle.pipeline import build
+from drivelink.demo.simbus import SocketcandServer
 from drivelink.loop import blackbox
 from drivelink.loop.blackbox import AFTER_S, BlackBox
 from drivelink.loop.finding import drop_oldest, event_of, kept, taken, wish_of
@@ -75,13 +76,24 @@ class Scene:
         return [(path, event_of(path).cause) for path in kept(self.path.parent / "kept", "elbow")]
 
 
-def test_that_a_joint_file_was_edited_is_the_daemons_to_say(tmp_path):
+def test_what_becomes_of_joint_file_and_bus_is_the_daemons_to_say(tmp_path):
     path = tmp_path / "elbow.toml"
     text = (Path(__file__).parent.parent / "examples" / "elbow.toml").read_text(encoding="utf-8")
-    path.write_text(text.replace('folder = "kept"', 'folder = "here"'))
-    command = [sys.executable, "-m", "drivelink.cli.blackbox", str(path)]
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0 and "edited" not in done.stderr
+    with SocketcandServer(port=0) as server:
+        text = text.replace(
+            'interface = "virtual"', f'interface = "socketcand"\noptions.port = {server.port}'
+        )
+        path.write_text(text.replace('folder = "kept"', 'folder = "here"'))
+        command = [sys.executable, "-m", "drivelink.cli.blackbox", str(path)]
+        box = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        ready = [time.monotonic() + 30.0]
+        while time.monotonic() < ready[-1]:
+            server.recv(0.05)
+            if len(ready) == 1 and any(client.raw for client in server._clients):
+                ready.append(time.monotonic() + 1.0)
+    time.sleep(1.0)
+    _, said = box.communicate(timeout=60)
+    assert box.returncode == 0 and "edited" not in said and "lost" not in said, said
 
 
 def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(tmp_path, caplog):

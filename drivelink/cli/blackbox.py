@@ -85,8 +85,8 @@ def main() -> int:
     add_bus(parser)
     args = parser.parse_args()
     log_to_stderr(logging.INFO)
-    logging.getLogger("can").setLevel(logging.CRITICAL)  # some interfaces log every partial read
-    logging.getLogger("drivelink.jointfile").setLevel(logging.ERROR)  # the daemon has said that it was edited
+    for name in ("can", "drivelink.jointfile", "drivelink.recording.bus"):  # for the daemon to say
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     os.nice(_NICE)
     ended = threading.Event()
     threading.Thread(target=_wait, args=(ended,), daemon=True).start()

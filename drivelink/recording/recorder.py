@@ -30,6 +30,7 @@ from drivelink.recording.sinks import Sink
 from estimator.sample import Sample
 
 _LOG = logging.getLogger("drivelink.recording")
+_BUS_LOG = logging.getLogger("drivelink.recording.bus")  # what a daemon on the same bus says, too
 
 # Messages of a key that wait; a snapshot has some megabytes.
 _DEPTHS = dict.fromkeys(("sample", "estimate", "external"), MAX_UNREAD) | {"snapshot": 2}
@@ -209,7 +210,8 @@ class BusTap:
                     if self._samples is not None:
                         self._put_samples(self._samples.feed(LoggedFrame(stamp_ns, cob_id, data, "")))
         except BusLostError as error:
-            _LOG.error("%s: the bus is lost: %s: no frames until it is back", self._section.channel, error)
+            text = "%s: the bus is lost: %s: no frames until it is back"
+            _BUS_LOG.error(text, self._section.channel, error)
             self._source = LostSource()
         return most <= 0
 
@@ -221,7 +223,7 @@ class BusTap:
         with suppress(BusError):
             self._bus = open_bus(self._section)
             self._source = open_source(self._bus)
-            _LOG.warning("%s: the bus is back", self._section.channel)
+            _BUS_LOG.warning("%s: the bus is back", self._section.channel)
 
     def close(self) -> None:
         """Close the bus."""

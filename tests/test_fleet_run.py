@@ -120,6 +120,7 @@ def test_a_killed_worker_loses_nothing_and_doubles_nothing(fleet, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_ctrl_c_leaves_what_is_finished(fleet, tmp_path):
     recordings = tmp_path / "recordings"
     recordings.mkdir()
@@ -130,8 +131,8 @@ def test_ctrl_c_leaves_what_is_finished(fleet, tmp_path):
     command = [sys.executable, "-m", "drivelink", "fleet", str(recordings), "--joints", str(fleet / "joints")]
     command += ["--out", str(out), "--workers", "1"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    end = time.monotonic() + 90
-    while len(list(out.glob("diagnoses/*/*/report.html"))) < 2 and time.monotonic() < end:
+    # However long that takes: on a busy machine none was finished in 90 s.
+    while len(list(out.glob("diagnoses/*/*/report.html"))) < 2 and process.poll() is None:
         time.sleep(0.1)  # the only worker begins the second when the first is told
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
     _, error = process.communicate(timeout=60)

@@ -129,9 +129,10 @@ def test_a_unit_of_the_other_axis_is_refused(axis, unit, right):
 
 
 def test_what_a_mapping_asks_for_in_vain_is_one_line(tmp_path):
-    names = parse_column_map([*MAP[:3], "angle=link_position_rad"])
+    names = parse_column_map([*MAP[:3], "stat=link_position_rad"])
     with pytest.raises(
-        RecordingError, match=r"--map angle=link_position_rad: no such column 'angle', found .*state"
+        RecordingError,
+        match=r"--map stat=link_position_rad: no such column 'stat', found .*; did you mean state\?$",
     ):
         read(theirs(tmp_path / "rig.csv"), JOINT, names=names)
     with pytest.raises(UsageError, match="given twice"):

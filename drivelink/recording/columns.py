@@ -103,8 +103,11 @@ def renamed(
     for name, source in names.items():
         if source.column not in columns:
             by = f"--map {source.column}={name}" if source.asked else f"recording.columns.{name}"
+            there = [*columns, *unread]
+            near = difflib.get_close_matches(source.column, there, n=1)
+            hint = f"; did you mean {near[0]}?" if near else ""
             raise RecordingError(
-                f"{where}: {by}: no such column {source.column!r}, found {some([*columns, *unread], 40)}"
+                f"{where}: {by}: no such column {source.column!r}, found {some(there, 40)}{hint}"
             )
     used = {source.column for source in names.values()}
     kept = {name: values for name, values in columns.items() if name not in used and name not in names}

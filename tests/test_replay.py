@@ -412,3 +412,17 @@ def test_publish_sends_every_estimate_to_a_subscriber(tmp_path, joint_path):
     # The replay begins when the subscriber is there: nothing is missing.
     assert [bits(Estimate(e.sequence, e.status, *e[3:])) for e in got] == [bits(e) for e in local]
     assert len(local) == 2000
+
+
+def test_samples_that_cannot_be_used_are_named_with_their_reading_and_time(tmp_path, joint_path, capsys):
+    path = sine.ours(tmp_path / "r.csv")
+    with path.open() as file:
+        lines = list(csv.reader(file))
+    place = lines[0].index("link_position_rad")
+    for line in lines[1001:]:
+        line[place] = "1e30"
+    path.write_text("".join(f"{','.join(line)}\n" for line in lines))
+    assert cli.main(["replay", str(path), "--joint", str(joint_path), "--json"]) == 0
+    reasons = {one["reason"]: one["first_s"] for one in json.loads(capsys.readouterr().out)["not_valid"]}
+    text = "the samples cannot be used: link position: the value is impossible"
+    assert reasons[text] == pytest.approx(float(lines[1001][lines[0].index("time_s")]), abs=0.1), reasons

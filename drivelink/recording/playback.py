@@ -242,7 +242,7 @@ class Summary:
 
     def __init__(self, motors: int, estimator: Estimator, keep: bool) -> None:
         self._estimator = estimator
-        self._why: dict[str, tuple[int, str]] = {}  # by its key: cycles, the last sentence
+        self._why: dict[str, tuple[int, str, float]] = {}  # by its key: cycles, the last sentence, first time
         self.count = self.fresh = self.valid = self.observable = 0
         self._keep = keep
         self._width = len(_columns(motors))
@@ -265,7 +265,11 @@ class Summary:
         if status & _VALID:
             self.valid += 1
         elif (why := why_not_valid(status, self._estimator)) is not None:
-            self._why[why[0]] = self._why.get(why[0], (0, ""))[0] + 1, why[1]
+            key, text = why
+            if key == "rejected" and (suspicion := self._estimator.suspicion()) is not None:
+                key, text = suspicion["text"], f"{text}: {suspicion['text']}"
+            count, _, first_s = self._why.get(key, (0, "", played.time_s))
+            self._why[key] = count + 1, text, first_s
         self.observable += status & _OBSERVABLE != 0
         self._last = played
         if self._keep:
@@ -295,14 +299,15 @@ class Summary:
         return max(periods - self.fresh, 0), periods
 
     def reasons(self) -> list[str]:
-        """Return why cycles are not valid, most frequent first: share of the cycles, last sentence."""
-        shares = [(count / self.count, text) for count, text in self._sorted()]
+        """Return why cycles are not valid, most frequent first: share of the cycles, first time, sentence."""
+        shares = [(count / self.count, text, first_s) for count, text, first_s in self._sorted()]
         return [
-            f"{'less than 0.1 %' if share < 0.001 else percent(share, 1)} of the cycles: {text}"
-            for share, text in shares
+            f"{'less than 0.1 %' if share < 0.001 else percent(share, 1)} of the cycles, "
+            f"first at {first_s:.3f} s: {text}"
+            for share, text, first_s in shares
         ]
 
-    def _sorted(self) -> list[tuple[int, str]]:
+    def _sorted(self) -> list[tuple[int, str, float]]:
         return sorted(self._why.values(), reverse=True)
 
     def document(self) -> dict[str, Any]:
@@ -315,7 +320,9 @@ class Summary:
             "samples_missing": self._missing()[0],
             "valid": self.valid,
             "observable": self.observable,
-            "not_valid": [{"reason": text, "cycles": count} for count, text in self._sorted()],
+            "not_valid": [
+                {"reason": text, "cycles": n, "first_s": round(first, 6)} for n, text, first in self._sorted()
+            ],
             "end": finite({name: getattr(estimate, name, None) for name in names}),
         }
 

@@ -14,6 +14,7 @@ from drivelink.errors import HarmfulModelError, RecordingError, UsageError, rais
 from drivelink.files import check_target
 from drivelink.jointfile import apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import as_read, diagnosed_model, floor_entry
+from drivelink.jointfile.digits import kept_model
 from drivelink.output import fitreport, plots, report, sentences
 from drivelink.output import motion as motions
 from drivelink.output.comparison import beside, fits, simulated
@@ -329,6 +330,7 @@ def fit(
     bandwidth = None if bandwidth_hz is None else 2.0 * math.pi * bandwidth_hz
     with raised_as(RecordingError, some(runs.paths), EstimatorError):
         found = identify(list(runs.records), runs.source.joint.model(), bandwidth)
+    found = replace(found, model=kept_model(found.model))
     for name, one in zip(runs.names_of_files, found.recordings, strict=True):
         _require_explained(name, one.train.relative, choice("unexplained"))
     return Fit(runs, found, bandwidth)

@@ -6,11 +6,13 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from operator import mul
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from drivelink import jointfile
 from drivelink.jointfile import JointFile, JointText
+from drivelink.jointfile.digits import kept, kept_model
 from drivelink.version import __version__
 from estimator.effects import LIBRARY, sharpened
 from estimator.errors import EstimatorError
@@ -29,10 +31,16 @@ def _baseline(
     records: Record | Sequence[Record], model: JointModel, surplus: float
 ) -> ResidualBaseline | None:
     try:
-        return measure_baseline(records, model, surplus) if can_monitor(model) else None
+        found = measure_baseline(records, model, surplus) if can_monitor(model) else None
     except EstimatorError as error:
         _LOG.warning("no residual baseline is written, so the daemon cannot raise the model alarm: %s", error)
         return None
+    return found and replace(
+        found,
+        residual_nm=kept(found.residual_nm, tuple(map(mul, found.residual_nm, found.log_std))),
+        torque_nm=kept(found.torque_nm, tuple(map(mul, found.torque_nm, found.log_std))),
+        log_std=kept(found.log_std, found.log_std),
+    )
 
 
 def floor_entry(record: Record | Sequence[Record], model: JointModel, surplus: float) -> dict[str, Any]:
@@ -112,7 +120,8 @@ def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
         )
         for i, motor in enumerate(model.motors)
     )
-    return replace(model, motors=motors, link_effects=_all_effects(model.link_effects, outcome, None))
+    whole = replace(model, motors=motors, link_effects=_all_effects(model.link_effects, outcome, None))
+    return kept_model(whole)
 
 
 def _all_effects(declared: tuple[Effect, ...], outcome: Diagnosis, motor: int | None) -> tuple[Effect, ...]:

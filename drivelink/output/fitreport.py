@@ -55,12 +55,13 @@ def as_json(
 
 
 def _entry(one: TransmissionFit, motor: Motor) -> dict[str, Any]:
-    entry: dict[str, Any] = {"model": one.model, "parameters": one.parameters, "std": one.std}
+    parameters = motor.transmission.parameters if one.parameters else {}
+    entry: dict[str, Any] = {"model": one.model, "parameters": parameters, "std": one.std}
     entry["motor"] = {
         "inertia_kg_m2": motor.inertia_kg_m2,
         "viscous_damping_nm_s_rad": motor.viscous_damping_nm_s_rad,
         "inertia_std_kg_m2": one.nuisance_std["inertia"],
-        "viscous_damping_std_nm_s_rad": one.nuisance_std["damping"],
+        "viscous_damping_std_nm_s_rad": motor.viscous_damping_std_nm_s_rad,
     }
     if motor.effects:
         entry["effects"] = [effect_entry(effect) for effect in motor.effects]

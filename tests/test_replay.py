@@ -426,3 +426,11 @@ def test_samples_that_cannot_be_used_are_named_with_their_reading_and_time(tmp_p
     reasons = {one["reason"]: one["first_s"] for one in json.loads(capsys.readouterr().out)["not_valid"]}
     text = "the samples cannot be used: link position: the value is impossible"
     assert reasons[text] == pytest.approx(float(lines[1001][lines[0].index("time_s")]), abs=0.1), reasons
+
+
+def test_a_file_in_the_place_of_the_plots_is_said_before_the_replay(tmp_path, joint_path, capsys):
+    """It was said after it: "File exists"."""
+    path = sine.ours(tmp_path / "r.csv")
+    assert cli.main(["replay", str(path), "--joint", str(joint_path), "--plots", str(joint_path)]) == 2
+    out, error = capsys.readouterr()
+    assert not out and error == f"drivelink replay: {joint_path}: expected a folder, got a file\n"

@@ -20,7 +20,7 @@ from drivelink.errors import ZenohError
 from drivelink.jointfile import ZenohSection, fingerprint, parse, read_text
 from drivelink.pubsub.clientbase import joints
 from drivelink.pubsub.publisher import JointPublisher
-from drivelink.pubsub.session import FILES, close_session, daemon_config, open_client, open_session
+from drivelink.pubsub.session import FILES, close_session, daemon_config, one_line, open_client, open_session
 
 
 @pytest.fixture(scope="module")
@@ -202,6 +202,11 @@ def test_where_nobody_answers_the_line_is_ours(endpoint, tmp_path):
     (tmp_path / "mine.json5").write_text(text)
     with pytest.raises(ZenohError, match=f"nobody answers at {re.escape(endpoint)}$"):
         open_client(endpoint, tmp_path / "mine.json5")
+
+
+def test_who_refuses_a_certificate_may_be_there():
+    text = one_line(zenoh.ZError("Unable to connect to any of [Single(tls/localhost:7447)]!"))
+    assert text == "nobody answers at tls/localhost:7447, or not to this certificate"
 
 
 def test_a_certificate_that_is_missing_is_one_line_with_its_key(tmp_path):

@@ -66,8 +66,11 @@ def run(args: argparse.Namespace) -> int:
     if args.strict:
         record = read(args.file, joint, base_dir=base_dir, channel=args.channel, names=names)
         gate(args.file, joint, record, strict=True)
+    inputs = [args.file, *([args.joint] if args.joint else [])]
     if args.out is not None:
-        check_target(args.out, [args.file, *([args.joint] if args.joint else [])], force=args.force)
+        check_target(args.out, inputs, force=args.force)
+    if args.plots is not None:
+        check_target(args.plots / "time.png", inputs, force=True, makes_folder=True)
     playback = open_playback(
         args.file, joint, base_dir, frames=True if args.frames else None, channel=args.channel, names=names
     )

@@ -273,7 +273,8 @@ def one_line(error: BaseException) -> str:
     """Return a zenoh error without locations in zenoh's sources."""
     text = " ".join(str(error).split())
     if nobody := re.match(r"Unable to connect to any of \[(.+?)\](?:[.!]|$)", text):
-        return "nobody answers at " + re.sub(r"Single\((.+?)\)", r"\1", nobody[1])
+        refused = ", or not to this certificate" if re.search(r"\b(?:tls|quic)/", nobody[1]) else ""
+        return "nobody answers at " + re.sub(r"Single\((.+?)\)", r"\1", nobody[1]) + refused
     return re.sub(r"\s+at /\S+?:\d+\.?(?=\]|\s|$)", "", text)
 
 

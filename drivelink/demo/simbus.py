@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Any
 
 import can
@@ -28,6 +29,7 @@ DEFAULT_PORT = 29536
 
 _LARGEST_BACKLOG = 1 << 20  # unread bytes at which a client is dropped
 _LONGEST_COMMAND = 1 << 12
+_READS = 15  # whose median is the usual step, though some have frames between two SYNCs
 _SETTLE_S = 0.05  # python-can's client takes its greeting for one whole read: no frame may follow at once
 _CHUNK = 1 << 16
 _SO_TIMESTAMPNS = 35  # socket(7): the kernel stamps what arrives; Linux
@@ -41,6 +43,8 @@ class _Client:
     socket: socket.socket
     received: str = ""
     stamp_s: float = field(default_factory=time.time)  # of what was received last
+    # between what was received: of the last reads
+    steps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_READS))
     unsent: bytearray = field(default_factory=bytearray)
     open: bool = False
     raw: bool = False
@@ -151,11 +155,13 @@ class SocketcandServer(can.BusABC):
         if len(rest) > _LONGEST_COMMAND:
             self._drop(client)
             return
-        # The stamp is that of the last one; those before it came between that and the last read.
+        # The stamp is that of the last one. Those before it came since the last read, as far apart as usual:
+        # a client that has paused did so before the first one, while this process stood still, too.
         before_s, client.stamp_s = client.stamp_s, _stamp_s(ancillary)
-        step_s = (client.stamp_s - before_s) / max(len(commands), 1)
-        for number, command in enumerate(commands, 1):
-            stamp_s = before_s + number * step_s
+        client.steps_s.append((client.stamp_s - before_s) / max(len(commands), 1))
+        step_s = min(client.steps_s[-1], median(client.steps_s))
+        for behind, command in zip(reversed(range(len(commands))), commands, strict=True):
+            stamp_s = client.stamp_s - behind * step_s
             self._obey(client, command.strip().removeprefix("<").split(), stamp_s)
 
     def _obey(self, client: _Client, words: list[str], stamp_s: float) -> None:

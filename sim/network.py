@@ -24,6 +24,7 @@ _WITHOUT_SYNC_S = 0.05  # without a SYNC for so long, the wall clock advances th
 _LONGEST_CATCH_UP_S = 0.2
 _PHASE_GAIN = 0.05  # of the lock of control periods to the SYNC
 _SAME_SYNC = 0.8  # periods: a SYNC that is less late, after the earliest ones, is the next one
+_DELAY_GAIN = 0.01  # of what is usual, where it grows: those of a stall of a few periods are not
 _TICK_S = 0.005
 _RETRY_S = 0.1
 
@@ -65,6 +66,7 @@ class Network:
         self._sync_wall_s = self._wall_s - _WITHOUT_SYNC_S
         self._anchor_s = time.time()
         self._stamp_s = 0.0  # of the last SYNC
+        self._delay_s = 0.0  # from the stamp of a SYNC until it is read, usually
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         for node in self.nodes:
@@ -228,16 +230,21 @@ class Network:
             return
         self._sync_wall_s = self._clock()
         answering = [node for node in self._alive if node.sync_id == can_id and node.latch(data)]
-        periods = 1 if self._lockstep else self._periods(stamp_s or time.time())
-        self._advance(periods)
+        stamp_s = stamp_s or time.time()
+        self._advance(1 if self._lockstep else self._periods(stamp_s))
         for node in answering:
-            node.transmit()
+            # In time or not at all: later it would be taken for the answer to the next SYNC.
+            if self._lockstep or time.time() - stamp_s < self._delay_s + self._period_s:
+                node.transmit()
 
     def _periods(self, stamp_s: float) -> int:
         """Whole control periods since the last SYNC, phase-locked to it."""
         since_s, self._stamp_s = stamp_s - self._stamp_s, stamp_s
+        delay_s = time.time() - stamp_s
+        self._delay_s = min(delay_s, self._delay_s + _DELAY_GAIN * (delay_s - self._delay_s))
         if not -_LONGEST_CATCH_UP_S < since_s < _LONGEST_CATCH_UP_S:
             self._anchor_s = stamp_s  # the clock has jumped, or there was no SYNC for long
+            self._delay_s = delay_s
             return 1
         late_s = stamp_s - self._anchor_s
         periods = max(1, int(late_s / self._period_s + 1.0 - _SAME_SYNC))

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import can
 import numpy as np
@@ -116,6 +117,26 @@ def test_the_world_does_not_run_on_while_syncs_wait():
     reads = itertools.count()
     ticks = served_ticks([-0.15 + 0.001 * k for k in range(50)], clock=lambda: 0.1 * next(reads))[:-1]
     assert {b - a for a, b in itertools.pairwise(ticks)} == {1}
+
+
+def test_a_sync_is_answered_in_time_or_not_at_all(monkeypatch):
+    """A late answer would be taken for that of a later SYNC: a reading some periods old, and a false contact."""
+    answered, clock = [], SimpleNamespace(time=lambda: now_s, monotonic=time.monotonic)
+    monkeypatch.setattr("sim.network.time", clock)
+    monkeypatch.setattr(Cia402Drive, "latch", lambda *_: True)
+    monkeypatch.setattr(Cia402Drive, "transmit", lambda _: answered.append(stamp_s))
+    rig, now_s = StubRig(), 100.0
+    with ScriptedBus([], threading.Event()) as bus:
+        network = Network(bus, [Cia402Drive(1, rig, 0)], rig)
+        network.power_on()
+        network._lockstep = False
+        for ahead_s in (0.0, -3600.0):  # also where the stamps are of another clock
+            answered.clear()
+            stamps = [100.0 + ahead_s + 0.001 * k for k in range(1, 60)]
+            for k, stamp_s in enumerate(stamps):
+                now_s = max(stamp_s - ahead_s + 0.0001, stamps[25] - ahead_s if 20 <= k < 25 else 0.0)
+                network._receive(sync(stamp_s))
+            assert answered == [*stamps[:20], *stamps[24:]]
 
 
 def clients(server, count):

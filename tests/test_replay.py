@@ -1,6 +1,7 @@
 """Replay: the same pipeline, bit for bit, from every format; and what the command leaves behind."""
 
 import csv
+import errno
 import itertools
 import json
 import logging
@@ -434,3 +435,15 @@ def test_a_file_in_the_place_of_the_plots_is_said_before_the_replay(tmp_path, jo
     assert cli.main(["replay", str(path), "--joint", str(joint_path), "--plots", str(joint_path)]) == 2
     out, error = capsys.readouterr()
     assert not out and error == f"drivelink replay: {joint_path}: expected a folder, got a file\n"
+
+
+def test_a_full_disk_for_the_plots_loses_no_result(tmp_path, joint_path, capsys, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device", "plots/time.png")
+
+    monkeypatch.setattr(Summary, "plot", full)
+    path = sine.ours(tmp_path / "r.csv")
+    assert (
+        cli.main(["replay", str(path), "--joint", str(joint_path), "--plots", str(tmp_path / "plots")]) == 1
+    )
+    assert " cycles, " in capsys.readouterr().out

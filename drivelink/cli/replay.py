@@ -104,16 +104,19 @@ def _report(
     took_s: float,
     interrupted: bool,
 ) -> None:
-    """Draw what is asked for, and print the result."""
+    """Print the result, and draw what is asked for; in this order, as a full disk then loses none."""
     warn(args.file, warnings)
-    made = summary.plot(args.plots, f"{joint}: {args.file.name}") if args.plots and summary.count else []
+
+    def plots() -> list[Path]:
+        return summary.plot(args.plots, f"{joint}: {args.file.name}") if args.plots and summary.count else []
+
     if args.json:
         document = {
             "recording": str(args.file),
             "joint": joint,
             **summary.document(),
             "estimates": str(args.out) if args.out else None,
-            "plots": [str(path) for path in made],
+            "plots": [str(path) for path in plots()],
             "warnings": list(warnings),
             "took_s": round(took_s, 3),
             "interrupted": interrupted,
@@ -122,11 +125,12 @@ def _report(
         return
     lines = [f"{args.file}: {summary.text(took_s)}"]
     lines += [f"  not valid in {line}" for line in summary.reasons()]
-    lines += [f"plot: {path}" for path in made]
     if args.out is not None:
         lines.append(f"estimates: {args.out}" + (" (up to the interruption)" if interrupted else ""))
     for line in lines:
         print(clean_text(line))
+    for path in plots():
+        print(clean_text(f"plot: {path}"))
 
 
 def _play(playback: Playback, sinks: Sequence[Sink], title: str) -> bool:

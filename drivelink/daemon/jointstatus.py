@@ -196,7 +196,8 @@ class JointStatus:
         if work and jitter:
             text += f"; p99 work {work['p99_us']:.0f} µs, SYNC late {jitter['p99_us']:.0f} µs"
         residual = loop_joint.pipeline.estimator.residual_nm
-        if math.isfinite(residual) and residual:  # 0: there was no motion to judge it by
-            text += f"; residual {number(residual, 2)} N·m"
+        known = math.isfinite(residual) and residual  # 0: there was no motion to judge it by
         ratio = residual_ratio(loop_joint.pipeline.model_monitor)
-        return text if ratio is None else f"{text}, {ratio:.2g} × baseline"
+        parts = [f"{number(residual, 2)} N·m"] if known else []
+        parts += [] if ratio is None else [f"{ratio:.2g} × baseline"]
+        return f"{text}; residual {', '.join(parts)}" if parts else text

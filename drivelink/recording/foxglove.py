@@ -123,7 +123,7 @@ class FoxgloveSink(MessageSink):
         try:
             import foxglove
         except ImportError as error:
-            raise UsageError("--foxglove: pip install 'drivelink-vsa[foxglove]'") from error
+            raise UsageError("--foxglove: needs its SDK: pip install 'drivelink-vsa[foxglove]'") from error
         self.counts = dict.fromkeys(sorted(self.wants), 0)
         self.set_up(joint)
         context = self._context = foxglove.Context()  # channels close with it

@@ -12,9 +12,10 @@ from matplotlib.ticker import MaxNLocator
 from drivelink.fleet.summary import LOOK, STATES, parameter_name, spaced
 from drivelink.output.document import Block, Document, Grid, Markup, Paragraph, Rows, Section, drawn
 from drivelink.output.document import page as draw
-from drivelink.output.numbers import number, ticks_each, with_interval
+from drivelink.output.numbers import ticks_each, with_interval
 from drivelink.plaintext import for_page, natural
 from estimator.effects import in_words
+from estimator.reasons import percent
 from estimator.sample import SIGMA_95
 
 _CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large
@@ -312,14 +313,14 @@ def _minute(time: str) -> str:
 def _effects(joint: dict[str, Any]) -> list[Grid]:
     rows: Rows = []
     for effect in joint["effects"]:
-        before, after = (number(100.0 * effect[f"error_{when}_relative"], 3) for when in ("before", "after"))
+        before, after = (percent(effect[f"error_{when}_relative"], 2) for when in ("before", "after"))
         rows.append(
             (
                 ", ".join(map(in_words, effect["names"])),
                 spaced(effect["location"]),
                 f"{effect['recordings']} of {effect['of']} recordings",
                 f"since {effect['since'][:10]}" + (" (significant)" if effect["significant"] else ""),
-                f"{before} → {after} % of the torque (median)",
+                f"{before} → {after} of the torque (median)",
                 Markup(_link(effect["report"], "diagnosis")),
             )
         )

@@ -34,7 +34,7 @@ pub struct Size {
 }
 
 /// The filtered columns of one motor.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Balance {
     /// What the columns are scaled by; zero before there was motion.
     pub size: Size,
@@ -61,25 +61,7 @@ impl Balance {
     /// At rest.
     #[must_use]
     pub fn new(family: Family) -> Balance {
-        Balance {
-            size: Size::default(),
-            family,
-            position: Channel::rest(0.0),
-            torque: Channel::rest(0.0),
-            light: Lanes::rest([0.0; CURVE]),
-            curve: Lanes::rest([0.0; CURVE]),
-            formed: Lanes::rest([0.0; FORMED]),
-            effects: Formed::default(),
-            elastic: Channel::rest(0.0),
-            resting: [Formed::default(); 2],
-            standing: [Formed::default(); 2],
-            waves: [0.0; 2],
-            stops: [0.0; 3],
-            last: 0.0,
-            low: f64::INFINITY,
-            high: f64::NEG_INFINITY,
-            speed: 0.0,
-        }
+        Balance { family, low: f64::INFINITY, high: f64::NEG_INFINITY, ..Balance::default() }
     }
 
     /// Forget everything.
@@ -94,11 +76,9 @@ impl Balance {
 
     /// As if the joint had been here forever.
     pub fn restart(&mut self, theta: f64, phi: f64, torque: f64) {
-        self.position = Channel::rest(theta);
-        self.torque = Channel::rest(torque);
-        self.formed = Lanes::rest([0.0; FORMED]);
-        (self.effects, self.elastic) = (Formed::default(), Channel::rest(0.0));
-        (self.resting, self.standing) = ([Formed::default(); 2], [Formed::default(); 2]);
+        (self.position, self.torque) = (Channel::rest(theta), Channel::rest(torque));
+        (self.formed, self.effects, self.elastic) = Default::default();
+        (self.resting, self.standing) = Default::default();
         self.rest_curve(phi);
     }
 

@@ -8,6 +8,8 @@ mod readout;
 mod rows;
 mod solve;
 
+use std::collections::VecDeque;
+
 use serde::{Deserialize, Serialize};
 
 use before::Before;
@@ -61,9 +63,8 @@ pub struct Blocks {
     per_block: f64, // probability of a change, before a block
     quick_limit: f64,
     open: Gram,
-    filled: f64, // rows of it; before friction is known, what of them is motion
-    ring: Vec<Gram>,
-    oldest: usize,
+    filled: f64,                 // rows of it; before friction is known, what of them is motion
+    ring: VecDeque<(Gram, f64)>, // with the largest `quick` in each
     waiting: Vec<Gram>,
     scores: Vec<Vector>,
     before: Option<Before>,
@@ -78,10 +79,9 @@ pub struct Blocks {
     torque: f64,      // rms of the transmission's torque
     friction: f64,    // rms of friction and hysteresis
     quick: f64,
-    peak: f64,       // of it in the open block …
-    peaks: Vec<f64>, // … and in those of the ring
-    good: usize,     // blocks in a row that were explained
-    doubted: usize,  // blocks since the last explained one
+    peak: f64,      // of it in the open block
+    good: usize,    // blocks in a row that were explained
+    doubted: usize, // blocks since the last explained one
     doubting: bool,
     suspected: bool, // the zero, of being elsewhere since a restart
     skipped: u32,    // rows that are still of what was before
@@ -134,8 +134,7 @@ impl Blocks {
             quick_limit: f_quantile(1.0, FEWEST as f64 * errors, alarms_per_hour * LOOK_S / 3600.0),
             open: Gram::default(),
             filled: 0.0,
-            ring: Vec::with_capacity(BLOCKS),
-            oldest: 0,
+            ring: VecDeque::with_capacity(BLOCKS),
             waiting: Vec::with_capacity(FEWEST),
             scores: Vec::with_capacity(BLOCKS),
             before: None,
@@ -149,7 +148,6 @@ impl Blocks {
             friction: 0.0,
             quick: 0.0,
             peak: 0.0,
-            peaks: Vec::with_capacity(BLOCKS),
             good: 0,
             doubted: 0,
             doubting: false,
@@ -192,11 +190,10 @@ impl Blocks {
 
     fn forget_rows(&mut self) {
         self.ring.clear();
-        self.peaks.clear();
         self.waiting.clear();
         self.take_open();
         (self.posterior, self.frame) = (self.spring.declared_posterior(), None);
-        (self.oldest, self.skipped, self.fitted) = (0, 0, false);
+        (self.skipped, self.fitted) = (0, false);
         (self.moved, self.located, self.placed) = (false, true, true);
         self.end_doubt();
         self.unform();
@@ -319,19 +316,10 @@ impl Blocks {
     }
 
     fn push(&mut self, block: Gram) {
-        let peak = std::mem::take(&mut self.peak);
-        if self.ring.len() < BLOCKS {
-            self.ring.push(block);
-            self.peaks.push(peak);
-        } else {
-            (self.ring[self.oldest], self.peaks[self.oldest]) = (block, peak);
-            self.oldest = (self.oldest + 1) % BLOCKS;
+        if self.ring.len() == BLOCKS {
+            self.ring.pop_front();
         }
-    }
-
-    /// The place of a block in the ring; 0: the newest.
-    fn place(&self, age: usize) -> usize {
-        (self.oldest + self.ring.len() - 1 - age) % self.ring.len()
+        self.ring.push_back((block, std::mem::take(&mut self.peak)));
     }
 
     /// Whether it is still to be told where positions count from since a restart.

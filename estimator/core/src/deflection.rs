@@ -20,7 +20,7 @@ type State = [f64; STATES];
 type Covariance = [State; STATES];
 
 /// See the module; fed every tick, tuned at every update.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct DeflectionFilter {
     inertia: f64,
     damping: f64,
@@ -46,7 +46,7 @@ pub struct DeflectionFilter {
 }
 
 /// How the joint moves, and how well that is foreseen.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Motion {
     jerk: f64,   // mean square of φ‴ …
     peak: f64,   // … and its largest value of late
@@ -97,7 +97,7 @@ impl DeflectionFilter {
         let k = (1.0 - p).powi(3) / (period * period);
         let plain = [[g, h, 0.0, 0.0, 0.0], [0.0, 0.0, g, h, k]];
         let settling = (3.0 * SETTLED / (PLAIN * bandwidth * period)).ceil() as i64;
-        DeflectionFilter {
+        let mut made = DeflectionFilter {
             inertia,
             damping,
             w: bandwidth,
@@ -106,19 +106,10 @@ impl DeflectionFilter {
             fade: (-dt_s / PEAK_S).exp(),
             settling,
             plain,
-            gains: plain,
-            x: [0.0; STATES],
-            p: None,
-            tuned: false,
-            modelled: false,
-            drift: 0.0,
-            motor_noise: 0.0,
-            motion: AT_REST,
-            foreseen: f64::INFINITY,
-            noise: 0.0,
-            wander: 0.0,
-            unsettled: settling,
-        }
+            ..DeflectionFilter::default()
+        };
+        made.reset();
+        made
     }
 
     /// Forget everything.

@@ -53,6 +53,14 @@ impl Estimator {
         }
     }
 
+    fn robust(&self) -> Option<&Robust> {
+        if let Estimator::Robust(robust) = self { Some(robust) } else { None }
+    }
+
+    fn robust_mut(&mut self) -> Option<&mut Robust> {
+        if let Estimator::Robust(robust) = self { Some(robust) } else { None }
+    }
+
     /// Forget everything that was learned.
     pub fn reset(&mut self) {
         match self {
@@ -73,36 +81,24 @@ impl Estimator {
 
     /// The next sample may not be of its moment: use it, but learn nothing from it.
     pub fn distrust(&mut self) {
-        match self {
-            Estimator::Paper(_) => {}
-            Estimator::Robust(robust) => robust.distrust(),
-        }
+        self.robust_mut().into_iter().for_each(Robust::distrust);
     }
 
     /// The next sample is later than its period by so many seconds; no further one is.
     pub fn delay_next(&mut self, late_s: f64) {
-        match self {
-            Estimator::Paper(_) => {}
-            Estimator::Robust(robust) => robust.delay_next(late_s),
-        }
+        self.robust_mut().into_iter().for_each(|robust| robust.delay_next(late_s));
     }
 
     /// Standard deviation of the joint's flexibility torque at the last sample, N·m; NaN: unknown.
     #[must_use]
     pub fn flexibility_torque_std(&self) -> f64 {
-        match self {
-            Estimator::Paper(_) => f64::NAN,
-            Estimator::Robust(robust) => robust.flexibility_torque_std(),
-        }
+        self.robust().map_or(f64::NAN, Robust::flexibility_torque_std)
     }
 
     /// What the model left unexplained of the torque balance at the last sample, N·m; NaN: unknown.
     #[must_use]
     pub fn residual(&self) -> f64 {
-        match self {
-            Estimator::Paper(_) => f64::NAN,
-            Estimator::Robust(robust) => robust.residual(),
-        }
+        self.robust().map_or(f64::NAN, Robust::residual)
     }
 
     /// What the world does to the link, by the last sample; `None` where no link dynamics are declared.
@@ -126,10 +122,7 @@ impl Estimator {
     /// The reading that is suspected, while something is.
     #[must_use]
     pub fn suspicion(&self) -> Option<Suspicion> {
-        match self {
-            Estimator::Paper(_) => None,
-            Estimator::Robust(robust) => robust.suspicion(),
-        }
+        self.robust()?.suspicion()
     }
 
     /// Why the last estimate is not valid; `None`: it is, or nothing has been estimated.
@@ -143,10 +136,7 @@ impl Estimator {
 
     /// Effects of one motor that nobody declared and evidence chose; `None`: the mode has none.
     pub fn undeclared(&self, motor: usize) -> Option<impl Iterator<Item = &'static str>> {
-        match self {
-            Estimator::Paper(_) => None,
-            Estimator::Robust(robust) => Some(robust.undeclared(motor)),
-        }
+        Some(self.robust()?.undeclared(motor))
     }
 
     /// Current parameters of one motor's transmission and their standard deviations, and their law.
@@ -162,9 +152,6 @@ impl Estimator {
     /// Dry friction of one motor beyond what is declared, and its standard deviation, N·m; `None`: not estimated.
     #[must_use]
     pub fn friction(&self, motor: usize) -> Option<(f64, f64)> {
-        match self {
-            Estimator::Paper(_) => None,
-            Estimator::Robust(robust) => robust.friction(motor),
-        }
+        self.robust()?.friction(motor)
     }
 }

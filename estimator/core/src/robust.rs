@@ -37,7 +37,6 @@ pub struct Robust {
     flexible: bool,
     period: f64,
     filters: Filters,
-    rate_gain: f64,
     settle: i64,
     looks: u64,
     said_periods: i64,
@@ -53,7 +52,7 @@ pub struct Robust {
 }
 
 /// What begins anew with a reset.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 struct Live {
     link: Channel,
     external: Option<External>,
@@ -79,28 +78,7 @@ struct Live {
 
 impl Live {
     fn start() -> Live {
-        Live {
-            link: Channel::rest(0.0),
-            external: None,
-            measured: f64::NAN,
-            late: 0.0,
-            noise: [NoiseMeter::default(); MOTORS + 1],
-            torque_noise: [NoiseMeter::default(); MOTORS],
-            zeros: Positions::default(),
-            last: Inputs::default(),
-            lever: f64::NAN,
-            zeros_known: true,
-            begins: true,
-            jumped: None,
-            started: false,
-            tick: 0,
-            unsettled: 0,
-            said: 0,
-            sequence: 0,
-            refused: None,
-            why: None,
-            estimate: None,
-        }
+        Live { measured: f64::NAN, lever: f64::NAN, zeros_known: true, begins: true, ..Live::default() }
     }
 }
 
@@ -136,7 +114,6 @@ impl Robust {
             motors: model.motors.len(),
             flexible: model.has_deflection(),
             period: period_s,
-            rate_gain: filters.rate_gain(period_s),
             settle: (SETTLED * filters.delay / period_s).ceil() as i64,
             looks,
             said_periods: (SAID_S / period_s).round() as i64,

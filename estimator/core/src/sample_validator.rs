@@ -63,7 +63,7 @@ pub struct SampleValidator {
     memory: Memory,
 }
 
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 struct Memory {
     sequence: Option<u64>,
     places: [f64; PLACES],
@@ -91,32 +91,11 @@ struct Memory {
     stood_still: bool, // one that has jumped, before it did
 }
 
-const FRESH: Memory = Memory {
-    sequence: None,
-    places: [0.0; PLACES],
-    slopes: [0.0; PLACES],
-    span: 0.0,
-    peaks: [0.0; PLACES],
-    steps: [f64::INFINITY; PLACES],
-    limits: [f64::INFINITY; PLACES],
-    fastest: [0.0; PLACES],
-    stopped_dead: [false; PLACES],
-    astray: [false; PLACES],
-    values: None,
-    runs: [0; CHANNELS],
-    stood: [0; CHANNELS],
-    usual: [0; CHANNELS],
-    torque: 0.0,
-    largest: [0.0; MOTORS],
-    wild: 0,
-    seen: 0,
-    samples: 0,
-    moved: 0,
-    rejected: 0,
-    motion: 0.0,
-    frozen: false,
-    stood_still: false,
-};
+impl Memory {
+    fn fresh() -> Memory {
+        Memory { steps: [f64::INFINITY; PLACES], limits: [f64::INFINITY; PLACES], ..Memory::default() }
+    }
+}
 
 impl SampleValidator {
     /// A validator of this joint's samples.
@@ -141,7 +120,7 @@ impl SampleValidator {
             learning: periods(NOISE_S) as u32,
             found: None,
             trail: vec![[f64::NAN; PLACES]; still as usize + 1].into(),
-            memory: FRESH,
+            memory: Memory::fresh(),
         }
     }
 
@@ -156,7 +135,7 @@ impl SampleValidator {
 
     /// Forget everything.
     pub fn reset(&mut self) {
-        self.memory = FRESH;
+        self.memory = Memory::fresh();
         self.trail.iter_mut().for_each(|places| *places = [f64::NAN; PLACES]);
     }
 
@@ -164,7 +143,7 @@ impl SampleValidator {
     pub fn lose_zeros(&mut self) {
         let Memory { torque, largest, usual, moved, .. } = self.memory;
         self.reset();
-        self.memory = Memory { torque, largest, usual, moved, ..FRESH };
+        self.memory = Memory { torque, largest, usual, moved, ..Memory::fresh() };
     }
 
     /// Smallest change of each position (motors, then the link) or of its changes: its resolution, rad; ∞ before any.

@@ -48,16 +48,10 @@ impl Filters {
         // White noise through w⁴/(s + w)⁴ has the correlation time 2 ∫ρ dt = 32/(5 w).
         (6.4 / (self.main.bandwidth * period_s)).max(1.0)
     }
-
-    /// √Σh² of the first derivative behind both filters: the noise of a rate over that of a position.
-    #[must_use]
-    pub fn rate_gain(&self, period_s: f64) -> f64 {
-        self.noise_gains(period_s)[1].sqrt()
-    }
 }
 
 /// A measured signal: its values behind G and behind F G, with their derivatives.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Channel {
     /// G of the signal and its derivatives.
     pub light: [f64; 3],
@@ -157,6 +151,12 @@ pub struct Lanes<const N: usize, const L: usize> {
     pub last: [f64; L],
 }
 
+impl<const N: usize, const L: usize> Default for Lanes<N, L> {
+    fn default() -> Lanes<N, L> {
+        Lanes::rest([0.0; L])
+    }
+}
+
 impl<const N: usize, const L: usize> Lanes<N, L> {
     /// As if they had had these values for ever.
     #[must_use]
@@ -238,7 +238,6 @@ mod tests {
     fn the_gain_of_white_noise_is_that_of_the_impulse_response() {
         let filters = Filters::new(60.0, T);
         let gains = filters.noise_gains(T);
-        assert_eq!(filters.rate_gain(T), gains[1].sqrt());
         // F alone, (w/(s + w))^4: 5 w/32 times the period; G before it takes a little.
         let main = 5.0 / 32.0 * 60.0 * T;
         assert!(gains[0] < main && gains[0] > 0.9 * main, "{} is not below {main}", gains[0]);

@@ -22,9 +22,10 @@ pub const FIRST: usize = 2;
 const RIDGE: f64 = 1e-12; // of the diagonal: two functions may be one
 
 /// The functions that a curve is a sum of.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub enum Family {
     /// u, u³, u⁵, u⁷, u⁹.
+    #[default]
     Smooth,
     /// sign(u) |u|ᵏ: a spring whose stiffness has a corner at zero.
     Kinked,

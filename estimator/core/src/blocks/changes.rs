@@ -34,9 +34,10 @@ impl Blocks {
         if self.ring.len() < 2 * FEWEST {
             return false;
         }
-        let mut window = self.ring[self.place(0)].clone();
+        let block = |age: usize| &self.ring[self.ring.len() - 1 - age].0;
+        let mut window = block(0).clone();
         let shows = |k: &usize| {
-            window.add(&self.ring[self.place(k - 1)], 1.0);
+            window.add(block(k - 1), 1.0);
             self.weigh(&window).is_some_and(|odds| {
                 odds.of(Cause::Nothing).probability + odds.of(Cause::Noise).probability < 0.5
             })
@@ -44,12 +45,7 @@ impl Blocks {
         let Some(began) = (2..=FEWEST).find(shows) else { return false };
         self.begin_doubt();
         self.skipped = 0;
-        self.ring.rotate_left(self.oldest);
-        self.peaks.rotate_left(self.oldest);
-        self.oldest = 0;
-        let kept = self.ring.len() - began;
-        self.waiting.extend(self.ring.drain(kept..));
-        self.peaks.truncate(kept);
+        self.waiting.extend(self.ring.drain(self.ring.len() - began..).map(|(block, _)| block));
         self.solve();
         true
     }
@@ -138,8 +134,6 @@ impl Blocks {
     pub(super) fn restart(&mut self, opens: Set) {
         self.carry_over(opens | set(CORNER.start..ASYMMETRY.end)); // they are of one size
         self.ring.clear();
-        self.peaks.clear();
-        self.oldest = 0;
         for k in 0..self.waiting.len() {
             let block = self.waiting[k].clone();
             self.push(block);

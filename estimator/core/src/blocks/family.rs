@@ -11,7 +11,8 @@ use crate::unknowns::{CORNER, SPRING, ZERO};
 impl Blocks {
     /// The spring's columns have grown by these factors.
     pub fn grow(&mut self, factors: &Row, balance: &Balance) {
-        for gram in self.ring.iter_mut().chain(&mut self.waiting).chain([&mut self.open]) {
+        let ring = self.ring.iter_mut().map(|(block, _)| block);
+        for gram in ring.chain(&mut self.waiting).chain([&mut self.open]) {
             gram.scale(factors);
         }
         self.deflection = balance.size.deflection;
@@ -82,8 +83,7 @@ impl Blocks {
             before.unexplained = usual; // the joint is as it was, but goes further: it may leave more
         }
         self.ring.clear();
-        self.peaks.clear();
-        (self.oldest, self.skipped) = (0, self.settle);
+        self.skipped = self.settle;
         self.take_open();
         self.fit_projection();
         self.restate();

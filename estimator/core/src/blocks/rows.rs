@@ -62,7 +62,7 @@ impl Blocks {
         if self.quick <= usual {
             return false;
         }
-        let held = self.peaks.iter().fold(0.0, |most: f64, peak| most.max(*peak));
+        let held = self.ring.iter().fold(0.0, |most: f64, (_, peak)| most.max(*peak));
         let (Some(frame), Some(known)) = (&self.frame, &self.posterior) else { return false };
         let along = frame.directions.map(|direction| dot(row, &direction));
         self.quick > usual.max(UNUSUAL * held) + self.quick_limit * known.variance_along(&along)

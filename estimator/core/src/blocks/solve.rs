@@ -132,7 +132,7 @@ impl Blocks {
             return;
         }
         let mut total = Gram::default();
-        self.ring.iter().for_each(|block| total.add(block, 1.0));
+        self.ring.iter().for_each(|(block, _)| total.add(block, 1.0));
         let torque = balance::variance(&total, balance::TORQUE).max(f64::MIN_POSITIVE);
         self.begin(&total, torque);
         if !self.is_located(&total) {
@@ -225,7 +225,7 @@ impl Blocks {
 
     pub(super) fn score(&mut self, frame: &Frame, residual: &Row, of: Set) {
         self.scores.clear();
-        for block in &self.ring {
+        for (block, _) in &self.ring {
             let image = block.times(residual);
             let mut score = [0.0; UNKNOWNS];
             unknowns(of).for_each(|i| score[i] = dot(&image, &frame.directions[i]));

@@ -70,7 +70,7 @@ impl Robust {
                 side.tune(link, noise);
             }
             if look {
-                let gain = self.rate_gain * (noise[0] + noise[1]).sqrt();
+                let gain = (self.noise_gains[1] * (noise[0] + noise[1])).sqrt();
                 side.update_excitation(link, now.at.deflection(i), gain, usable, look_s);
             }
             if usable && side.excited {

@@ -22,13 +22,17 @@ impl Robust {
 
     /// The zero of one motor has been found so far from where its deflections are counted from.
     pub(super) fn recentre(&mut self, i: usize, off: f64) {
+        self.count_from(i, off);
+        let at = &self.live.last.at;
+        self.sides[i].recentre(at.motor[i], at.deflection(i), self.live.last.torque[i]);
+    }
+
+    /// Positions of one motor are counted from so far on.
+    fn count_from(&mut self, i: usize, off: f64) {
         self.live.zeros.motor[i] += off;
         self.live.last.at.motor[i] -= off;
         self.live.last.present.motor[i] -= off;
         self.live.unsettled = self.settle;
-        let at = &self.live.last.at;
-        let side = &mut self.sides[i];
-        side.recentre(at.motor[i], at.deflection(i), self.live.last.torque[i]);
     }
 
     /// Positions may count from anywhere: each motor's from where they did, if blocks bear it out, or from here.
@@ -46,21 +50,14 @@ impl Robust {
 
     /// Blocks say that a motor's zero is not where it was before a restart; nor are those of which they say nothing yet.
     pub(super) fn lose_here(&mut self, lost: [bool; MOTORS]) {
-        self.live.unsettled = self.settle;
-        for (i, side) in self.sides.iter_mut().enumerate() {
-            if !lost[i] && !side.blocks.is_suspected() {
+        for i in 0..self.motors {
+            if !lost[i] && !self.sides[i].blocks.is_suspected() {
                 continue;
             }
-            let off = if self.flexible { self.live.last.at.deflection(i) } else { 0.0 };
-            self.live.zeros.motor[i] -= off;
-            self.live.last.at.motor[i] += off;
-            self.live.last.present.motor[i] += off;
-            side.move_zero(false);
-            side.restart(
-                self.live.last.at.motor[i],
-                self.live.last.at.deflection(i),
-                self.live.last.torque[i],
-            );
+            self.count_from(i, if self.flexible { -self.live.last.at.deflection(i) } else { 0.0 });
+            let at = &self.live.last.at;
+            self.sides[i].move_zero(false);
+            self.sides[i].restart(at.motor[i], at.deflection(i), self.live.last.torque[i]);
         }
     }
 

@@ -143,7 +143,7 @@ impl Blocks {
         if opens & set(SPRING) != 0 {
             self.spring.open();
         }
-        (self.lost, self.located) = (self.lost || opens >> ZERO & 1 == 1, true); // it is not far
+        self.lost |= opens >> ZERO & 1 == 1;
         self.solve();
     }
 

@@ -83,7 +83,6 @@ choices! {
     GROWN: f64 = 1.5, "", "times the range seen that a curve is used over", "beyond it, powers say nothing";
     MARGIN: f64 = 1.02, "", "times the range seen that a law is projected on", "the next motion is a little larger";
     REACHED: f64 = 0.98, "", "of where a law ends", "its slope is finite there";
-    NEAR: f64 = 0.01, "jump", "a zero that comes back so near is as it was", "jumps are whole counts";
     SLOW: f64 = 0.02, "largest velocity", "over which dry friction changes its sign, and below which nothing is learned", "Stribeck speeds are faster";
     JUMP_RAD: f64 = 1e-3, "rad", "smallest jump of a position", "acceleration moves a joint less in a period";
     LEVER_RAD: f64 = 0.02, "rad", "by which motor 2 of a serial joint makes another stiffness", "a lever of one radian changes it by 4 %";

@@ -2,7 +2,7 @@
 
 use super::Robust;
 use crate::align::Positions;
-use crate::choices::{AHEAD_S, NEAR};
+use crate::choices::AHEAD_S;
 use crate::external::LinkMomentum;
 use crate::sample::MOTORS;
 
@@ -51,34 +51,14 @@ impl Robust {
     }
 
     /// Encoders have moved their zeros: go on as if they had not.
-    pub(super) fn move_zeros(&mut self, mut jumps: [f64; MOTORS + 1], at: &Positions, sequence: u64) {
-        let m = self.motors;
+    pub(super) fn move_zeros(&mut self, jumps: [f64; MOTORS + 1], at: &Positions, sequence: u64) {
         let ahead =
             (sequence.wrapping_sub(self.live.sequence) as f64 + self.alignment.periods.abs()) * self.period;
-        // A deflection that went on as it was measures a jump; the validator is coarse.
-        let now = at.from_zeros(&self.live.zeros);
-        for i in 0..m {
-            let side = &self.sides[i];
-            if ahead > AHEAD_S || side.rigid || side.deflection.unsettled > 0 {
-                continue;
-            }
-            let off = now.deflection(i) - side.deflection.at(ahead);
-            if jumps[i] != 0.0 && jumps[m] == 0.0 {
-                jumps[i] = -off;
-            } else if jumps[m] != 0.0 && jumps[i] == 0.0 {
-                jumps[m] = off;
-            }
-        }
-        let moved = |zero: f64, jump: f64| {
-            // One that jumps back has come home exactly.
-            let moved = zero + jump;
-            if moved.abs() < NEAR * jump.abs() { 0.0 } else { moved }
-        };
-        for i in 0..m {
-            self.live.zeros.motor[i] = moved(self.live.zeros.motor[i], jumps[i]);
+        for i in 0..self.motors {
+            self.live.zeros.motor[i] += jumps[i];
         }
         if self.flexible {
-            self.live.zeros.link = moved(self.live.zeros.link, jumps[m]);
+            self.live.zeros.link += jumps[self.motors];
         }
         let now = at.from_zeros(&self.live.zeros);
         for (i, side) in self.sides.iter_mut().enumerate() {

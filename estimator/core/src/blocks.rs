@@ -91,8 +91,6 @@ pub struct Blocks {
     #[serde(with = "crate::snapshot::array")]
     residual: Row,
     odds: Option<Odds>,
-    /// Whether samples of late could not be used.
-    pub spoilt: bool,
     /// How noisy the readings are.
     pub readings: Readings,
     /// The least and the largest deflection since they are counted from where they are, rad.
@@ -154,7 +152,6 @@ impl Blocks {
             frame: None,
             residual: [0.0; crate::gram::COLUMNS],
             odds: None,
-            spoilt: false,
             readings: Readings::default(),
             seen: [0.0; 2],
             family: Family::of(Some(&spring.law)),

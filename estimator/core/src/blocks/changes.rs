@@ -105,9 +105,6 @@ impl Blocks {
         self.doubted += 1;
         let Some(odds) = self.weigh_waiting() else { return Closed::Unexplained };
         self.odds = Some(odds);
-        if self.spoilt {
-            self.waiting.clear(); // samples that could not be used were among them: no joint is like that
-        }
         if self.waiting.len() >= 2 && self.is_change(&odds) && !self.is_unconfirmed() {
             // All that the window does not tell apart is open.
             let likely = odds.likely(|cause| cause.entry().opens != 0);

@@ -74,7 +74,6 @@ impl Robust {
                 side.update_excitation(link, now.at.deflection(i), gain, usable, look_s);
             }
             if usable && side.excited {
-                side.blocks.spoilt = self.live.refused.is_some();
                 shifts[i] = side.learn(noise, step, torque_noise, &self.noise_gains);
             }
         }

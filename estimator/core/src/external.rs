@@ -27,12 +27,21 @@ use crate::effects::{Coordinates, Element};
 use crate::filters::StateVariableFilter;
 use crate::model::{Link, Model};
 use crate::settings::{Priors, Settings};
+use crate::signals::Lanes;
 use contact::Judge;
 use link_errors::{DRY, LinkErrors};
 
 /// Of how far the declared link is off, as that of the regression, s.
 const MEMORY_S: f64 = BLOCKS as f64 * BLOCK_S;
 const TINY: f64 = 1e-12; // keeps a division finite
+// Channels: q, g, τ_e, τ_k, and what a late sample is off by in q and in g + τ_e.
+const POSITION: usize = 0;
+const GRAVITY: usize = 1;
+const CARRIED: usize = 2;
+const MEASURED: usize = 3;
+const SHIFTED: usize = 4;
+const PULLED: usize = 5;
+const CHANNELS: usize = 6;
 
 /// Bits of [`External::status`].
 pub mod status {
@@ -165,14 +174,8 @@ pub struct LinkMomentum {
     unsettled: i64,
     known: bool, // whether τ_e is
     moved: bool, // whether q may count from elsewhere than gravity's phase is declared from
-    position: [f64; 3],
-    gravity: [f64; 3],
-    carried: [f64; 3],
-    measured: [f64; 3],
-    shifted: [f64; 3], // what a late sample is off by in q …
-    pulled: [f64; 3],  // … and in g + τ_e
-    last: [f64; 6],    // of these channels, in this order
-    dry: f64,          // undeclared dry friction, as a share of the torque carried
+    channels: Lanes<3, CHANNELS>,
+    dry: f64, // undeclared dry friction, as a share of the torque carried
     errors: LinkErrors,
     judge: Judge,
     trailing: f64, // the published torque behind one more delay of the filter
@@ -204,13 +207,7 @@ impl LinkMomentum {
             unsettled: 0,
             known: false,
             moved: false,
-            position: [0.0; 3],
-            gravity: [0.0; 3],
-            carried: [0.0; 3],
-            measured: [0.0; 3],
-            shifted: [0.0; 3],
-            pulled: [0.0; 3],
-            last: [0.0; 6],
+            channels: Lanes::default(),
             judge: Judge::new(settings, filter.bandwidth, period_s),
             filter,
             dry: priors.coulomb_friction,
@@ -248,10 +245,7 @@ impl LinkMomentum {
 
     /// At rest here.
     pub fn restart(&mut self, q: f64, carried: f64) {
-        let rest = StateVariableFilter::<3>::rest;
-        self.last = [q, gravity(&self.link, q), carried, 0.0, 0.0, 0.0];
-        (self.position, self.gravity, self.carried) = (rest(q), rest(self.last[1]), rest(carried));
-        (self.measured, self.shifted, self.pulled) = (rest(0.0), rest(0.0), rest(0.0));
+        self.channels = Lanes::rest([q, gravity(&self.link, q), carried, 0.0, 0.0, 0.0]);
         self.distrust();
     }
 
@@ -267,25 +261,15 @@ impl LinkMomentum {
     ///
     /// `late`: by how much they are later than their period, s. Each is then off by its rate times that.
     pub fn feed(&mut self, q: f64, carried: Option<f64>, measured: f64, late: f64) {
-        let before = self.last;
         let known = carried.filter(|torque| torque.is_finite());
         let external = if measured.is_finite() { measured } else { 0.0 };
         let ahead = 3.0 / self.filter.bandwidth; // the filtered rates are as old as that
-        let off = |channel: &[f64; 3]| late * (channel[1] + ahead * channel[2]);
-        let (shifted, pulled) = (off(&self.position), off(&self.gravity) + off(&self.carried));
-        let carried = known.unwrap_or(before[2]);
-        self.last = [q, gravity(&self.link, q), carried, external, shifted, pulled];
-        let channels = [
-            &mut self.position,
-            &mut self.gravity,
-            &mut self.carried,
-            &mut self.measured,
-            &mut self.shifted,
-            &mut self.pulled,
-        ];
-        for (i, channel) in channels.into_iter().enumerate() {
-            self.filter.smooth.apply(channel, before[i], self.last[i]);
-        }
+        let [_, rates, bends] = self.channels.state;
+        let off = |channel: usize| late * (rates[channel] + ahead * bends[channel]);
+        let (shifted, pulled) = (off(POSITION), off(GRAVITY) + off(CARRIED));
+        let carried = known.unwrap_or(self.channels.last[CARRIED]);
+        let now = [q, gravity(&self.link, q), carried, external, shifted, pulled];
+        self.channels.smooth(&self.filter, now);
         self.unsettled -= 1;
         self.known = known.is_some();
         if !self.known || late > LATEST * self.period {
@@ -312,36 +296,37 @@ impl LinkMomentum {
             return self.latest.publish(External::nothing(sequence), self.period);
         }
         let link = &self.link;
-        let [position, velocity, acceleration] = self.position;
+        let [now, rates, bends] = self.channels.state;
+        let [position, velocity, acceleration] = [now[POSITION], rates[POSITION], bends[POSITION]];
         let c = Coordinates {
             link_position: position,
             link_velocity: velocity,
             link_acceleration: acceleration,
             ..Coordinates::default()
         };
-        let own = link.inertia * acceleration + link.damping * velocity + self.gravity[0];
+        let own = link.inertia * acceleration + link.damping * velocity + now[GRAVITY];
         let own = own + self.effects.iter().map(|element| element.torque(&c)).sum::<f64>();
-        let sum = own + self.carried[0];
+        let sum = own + now[CARRIED];
         let damping = link.damping_std.powi(2) + carried.skew_std.powi(2);
         // From another phase, gravity is off by up to twice its amplitude.
         let anywhere = if self.moved { 2.0 * link.gravity } else { 0.0 };
         let (dry, gravity) = (self.dry * self.judge.largest, link.gravity_std.powi(2) + anywhere * anywhere);
         let prior = [f64::INFINITY, link.inertia_std.powi(2), damping, gravity, gravity, dry * dry];
-        let row = self.errors.row(link, self.position);
+        let row = self.errors.row(link, [position, velocity, acceleration]);
         self.errors.forget(row[DRY], self.period);
         let row = std::array::from_fn(|i| if prior[i] > 0.0 { row[i] } else { 0.0 }); // 0: known exactly
         let (off, unknown) = self.errors.at(&row, &prior, -carried.skew, self.effects.is_empty());
         // A reading that is rounded errs alike for as long as it stands: what the spring makes of it is no noise.
         let read = carried.reading + carried.stiffness.powi(2) * noise;
         let white = noise * (link.inertia.powi(2) * self.gains[2] + link.damping.powi(2) * self.gains[1]);
-        let late = link.inertia * self.shifted[2] + link.damping * self.shifted[1] + self.pulled[0];
+        let late = link.inertia * bends[SHIFTED] + link.damping * rates[SHIFTED] + now[PULLED];
         let late = late * late;
         let around = carried.variance + read + unknown + late;
         let valid = valid && self.unsettled <= 0 && (sum + around + white).is_finite();
-        let (torque, contact) = self.judge.judge(sum - off, self.carried[0], around, white, valid);
+        let (torque, contact) = self.judge.judge(sum - off, now[CARRIED], around, white, valid);
         if valid {
             let curve = carried.variance + (LINK_FLOOR * self.judge.largest).powi(2);
-            self.learn(&row, sum - self.measured[0], curve, read + white + late);
+            self.learn(&row, sum - now[MEASURED], curve, read + white + late);
         }
         // What it has changed by over the filter's delay, it may have changed by since.
         let moved = torque - self.trailing;
@@ -352,8 +337,8 @@ impl LinkMomentum {
             status: if valid { status::VALID } else { 0 } | if contact { status::CONTACT } else { 0 },
             torque,
             torque_std: (around + white + moved * moved).sqrt(),
-            link_torque: self.measured[0] - own,
-            difference: sum + carried.skew * velocity - self.measured[0],
+            link_torque: now[MEASURED] - own,
+            difference: sum + carried.skew * velocity - now[MEASURED],
         };
         self.latest.publish(external, self.period)
     }

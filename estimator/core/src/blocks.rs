@@ -59,6 +59,7 @@ pub struct Blocks {
     priors: Priors,
     period: f64,
     rows: f64,
+    correlated: f64,
     per_block: f64, // probability of a change, before a block
     quick_limit: f64,
     open: Gram,
@@ -123,6 +124,7 @@ impl Blocks {
             priors: *priors,
             period: period_s,
             rows,
+            correlated,
             per_block: (alarms_per_hour * BLOCK_S / 3600.0).clamp(1e-12, 0.5),
             quick_limit: f_quantile(1.0, FEWEST as f64 * errors, alarms_per_hour * LOOK_S / 3600.0),
             open: Gram::default(),

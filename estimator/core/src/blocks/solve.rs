@@ -98,7 +98,7 @@ impl Blocks {
         let prior = Prior::independent([0.0; UNKNOWNS], &wide);
         let Some(rough) = solve(&reduced, frame.set, &prior, reduced[0][0]) else { return };
         let left = total.quadratic(&frame.residual(&rough.x, rough.set)) / total.rows;
-        let Some(found) = solve(&reduced, frame.set, &prior, left * self.noise.correlated) else { return };
+        let Some(found) = solve(&reduced, frame.set, &prior, left * self.correlated) else { return };
         if found.x[1] > SURE * found.covariance[1][1].sqrt() {
             self.spring.alpha = [0.0; PARAMETERS];
             self.spring.alpha[0] = found.x[1].recip();
@@ -112,7 +112,7 @@ impl Blocks {
         }
         let few = self.ring.len() <= FEWEST && self.before.is_none();
         if self.spring.is_searched() && (few || !self.spring.known) {
-            self.start(total, self.noise.variance * self.noise.correlated);
+            self.start(total, self.noise.variance * self.correlated);
         }
         if few && !self.spring.is_anchored() && matches!(self.spring.law, Law::Polynomial | Law::Linear) {
             self.start_by_deflection(total);
@@ -205,6 +205,18 @@ impl Blocks {
             let Some(whole) = solve(reduced, frame.set, prior, noise) else { return };
             let residual = frame.residual(&whole.x, whole.set);
             self.noise.variance = (total.quadratic(&residual) / total.rows).max(floor);
+            if self.ring.len() < FEWEST {
+                continue;
+            }
+            self.score(frame, &residual, whole.set);
+            let (mut seen, mut foreseen) = ([0.0; UNKNOWNS], [0.0; UNKNOWNS]);
+            for i in unknowns(whole.set) {
+                seen[i] = self.scores.iter().map(|score| score[i] * score[i]).sum();
+                foreseen[i] = self.noise.variance * reduced[i][i];
+            }
+            let active = || unknowns(whole.set & ACTIVE);
+            let ratio = active().map(|i| seen[i] / foreseen[i].max(f64::MIN_POSITIVE)).sum::<f64>();
+            self.noise.correlated = (ratio / active().count().max(1) as f64).max(self.correlated);
         }
     }
 

@@ -56,6 +56,20 @@ def test_a_torque_that_is_reported_late_is_published_for_the_present(spin, link_
     assert error < left * np.std(true) < 0.1 * waiting
 
 
+def test_a_link_that_is_late_is_no_effect_of_a_spring_that_bends():
+    """What the link moves meanwhile is multiplied with the stiffness: of few of its terms, effects made up the rest."""
+    t, k, b, late_s = T * np.arange(N), 60.0, 25.0, 1e-3
+    theta, of_motor, phi = _motion(t, 0.0)
+    late_theta, _, late_phi = _motion(t - late_s, 0.0)
+    torque = k / b * np.sign(phi) * np.expm1(b * np.abs(phi))
+    noise = np.random.default_rng(5).normal(scale=1e-5, size=(2, N))
+    read = joints.recorded(theta + noise[0], of_motor + K * phi - torque, late_theta + late_phi + noise[1], T)
+    found, estimator = kit.play(joints.joint_model(B, D, model="exponential"), read.samples())
+    assert not estimator.undeclared()[0]
+    assert np.mean(found.valid[-6000:]) > 0.97
+    assert np.std((found.torque_nm - torque)[-6000:]) < 0.02 * np.std(torque)  # late_s × φ′ is 6 % of φ
+
+
 def _slow(stiff, noise_rad, late_s=0.0, stated_s=0.0):
     """What is found of a slow joint whose file states all, in closed form (eq 5), and its torque's error over its rms."""
     t, rng = T * np.arange(N), np.random.default_rng(4)

@@ -20,7 +20,13 @@ use crate::spring::{FIRST, Family, TERMS};
 const STOP_WIDTHS: [f64; 3] = [0.05, 0.15, 0.45]; // of half the range of u: a memory of one width lies between two, and a wider stop is a spring
 const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
 const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len() + 2; // columns that are functions of the raw φ
-const FORMED: usize = 19; // columns of lightly filtered signals: dry, soft, load ×2, late ×5, read ×2, stops ×3, sine ×2, cosine ×2, q′
+// Columns of lightly filtered signals: dry, soft, load ×2, late, read, stops, sine, cosine, q′.
+const OF_LATE: usize = 4;
+const OF_READ: usize = OF_LATE + TERMS;
+const OF_STOPS: usize = OF_READ + FIRST;
+const OF_SINE: usize = OF_STOPS + STOP_WIDTHS.len();
+const OF_COSINE: usize = OF_SINE + FIRST;
+const FORMED: usize = OF_COSINE + FIRST + 1;
 
 /// What the columns are scaled by, taken from the motion.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -179,12 +185,11 @@ impl Balance {
         (factors[CORNER], curve[CURVE - 1]) = (ratio * ratio, ratio * ratio);
         self.light.scale(&curve);
         self.curve.scale(&curve);
-        let slopes = &terms[TERMS..];
         let mut formed = [1.0; FORMED];
-        formed[2..4].copy_from_slice(&terms[..2]);
-        formed[4..9].copy_from_slice(slopes);
-        for from in [9, 14, 16] {
-            formed[from..from + FIRST].copy_from_slice(&slopes[..FIRST]);
+        formed[2..OF_LATE].copy_from_slice(&terms[..2]);
+        formed[OF_LATE..OF_READ].copy_from_slice(&terms[TERMS..]);
+        for from in [OF_READ, OF_SINE, OF_COSINE] {
+            formed[from..from + FIRST].copy_from_slice(&terms[TERMS..TERMS + FIRST]);
         }
         self.formed.scale(&formed);
         factors
@@ -229,13 +234,13 @@ impl Balance {
         let (sine, cosine) = q.sin_cos();
         self.waves = [sine, cosine];
         let mut now = [0.0; FORMED];
-        now[..4].copy_from_slice(&[sign, soft, load[0], load[1]]);
-        now[4..9].iter_mut().zip(&slopes[TERMS..]).for_each(|(late, slope)| *late = -slope * q_rate);
-        for (from, signal) in [(9, q), (14, sine), (16, cosine)] {
+        now[..OF_LATE].copy_from_slice(&[sign, soft, load[0], load[1]]);
+        now[OF_LATE..].iter_mut().zip(&slopes[TERMS..]).for_each(|(late, slope)| *late = -slope * q_rate);
+        for (from, signal) in [(OF_READ, q), (OF_SINE, sine), (OF_COSINE, cosine)] {
             (now[from], now[from + 1]) = (-first * signal, -second * signal);
         }
-        now[11..14].copy_from_slice(&[-a, -b, -c]);
-        now[18] = -q_rate;
+        now[OF_STOPS..OF_SINE].copy_from_slice(&[-a, -b, -c]);
+        now[FORMED - 1] = -q_rate;
         self.formed.smooth(&filters.main, now);
     }
 

@@ -213,6 +213,23 @@ mod tests {
     }
 
     #[test]
+    fn slopes_hold_the_stiffness_of_a_law_that_bends_and_two_of_them_do_not() {
+        let (law, alpha, size): (Law, &[f64], f64) = (Law::Exponential, &[100.0, 9.0], 0.2);
+        let family = Family::of(Some(&law));
+        let projection = Projection::new(&family, size, f64::INFINITY);
+        let (all, first) = projection.of_slopes(|phi| law.at(phi, alpha).1);
+        let worst = |weights: &[f64]| {
+            let off = |k: i32| {
+                let u = f64::from(k) / 50.0;
+                let sum: f64 = family.at(u, size)[TERMS..].iter().zip(weights).map(|(b, a)| b * a).sum();
+                (sum / law.at(u * size, alpha).1 - 1.0).abs()
+            };
+            (-50..=50).map(off).fold(0.0, f64::max)
+        };
+        assert!(worst(&all) < 0.01 && worst(&first) > 0.1, "{} {}", worst(&all), worst(&first));
+    }
+
+    #[test]
     fn each_family_holds_its_laws() {
         assert!(worst(&Law::Polynomial, &[100.0, 2000.0, 5e4], 0.2, 0.0) < 1e-7);
         assert!(worst(&Law::Polynomial, &[100.0, 2000.0], 0.2, 0.07) < 1e-7); // the zero is elsewhere

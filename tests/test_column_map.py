@@ -14,6 +14,7 @@ from drivelink.jointfile.columns import UNITS
 from drivelink.recording import read
 from drivelink.recording.columns import column_map, parse_column_map
 from drivelink.recording.formats import FORMATS, Format, open_sink
+from drivelink.recording.playback import open_playback
 
 TEXT = """\
 name = "sine"
@@ -140,6 +141,8 @@ def test_what_a_mapping_asks_for_in_vain_is_one_line(tmp_path):
     open_sink(tmp_path / "r.mcap", JOINT).close()
     with pytest.raises(UsageError, match="only CSV files have columns to be named"):
         read(tmp_path / "r.mcap", JOINT, names=names)
+    with pytest.raises(UsageError, match=r"rig.csv: --channel: expected a raw CAN log, this one has samples"):
+        open_playback(tmp_path / "rig.csv", JOINT, tmp_path, channel="can1")
 
 
 COLUMNS = """\

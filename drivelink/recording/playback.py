@@ -15,7 +15,7 @@ import numpy as np
 
 from drivelink._core import Assembler, JointPipeline, Tick
 from drivelink.cycle.pipeline import build
-from drivelink.errors import DrivelinkError, RecordingError
+from drivelink.errors import DrivelinkError, RecordingError, UsageError
 from drivelink.jointfile import JointFile
 from drivelink.output.numbers import with_interval
 from drivelink.pubsub.publisher import JointPublisher, finite
@@ -91,10 +91,13 @@ def open_playback(
 
     Raises:
         RecordingError: it cannot be read, or is incomplete.
+        UsageError: `channel` for what is no raw CAN log.
     """
     if is_frame_log(path, frames):
         log = FrameLog(path, joint, base_dir, channel)
         return Playback(joint, log.period_s, None, lambda _: log.cycles())
+    if channel is not None and path.exists():
+        raise UsageError(f"{path}: --channel: expected a raw CAN log, this one has samples")
     if path.suffix.lower() == ".mcap":
         warn_of_another(path, joint.name)
         recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)

@@ -79,7 +79,6 @@ REASONS: dict[str, dict[str, str]] = {
 
 
 NUMERIC = {
-    "blocks/before.rs LINEAR": "part of the motion that is a small step of the zero",
     "blocks/solve.rs WIDE": "a prior that says nothing",
     "external.rs MEMORY_S": "of others",
     "external.rs TINY": "keeps a division finite",

@@ -278,6 +278,9 @@ impl Blocks {
         }
         self.end_doubt();
         self.solve();
+        if self.lost && !self.spring.is_constant() && !self.is_explained() {
+            self.lose_zero(); // it was located wrongly
+        }
         Closed::Added
     }
 

@@ -98,7 +98,10 @@ pub struct Blocks {
     pub seen: [f64; 2],
     /// The functions that the spring's curve is a sum of.
     pub family: Family,
-    placed: bool, // two blocks say where it is
+    located: bool, // the zero, so well that the balance can be linearised
+    placed: bool,  // two blocks say where it is
+    /// How far a lost zero is from where deflections are counted from, rad; 0: near.
+    pub off: f64,
     /// Whether evidence chose a zero that is not the declared one.
     pub moved: bool,
     /// Maximum a posteriori, with its covariance; `None`: not enough motion yet.
@@ -157,7 +160,9 @@ impl Blocks {
             readings: Readings::default(),
             seen: [0.0; 2],
             family: Family::of(Some(&spring.law)),
+            located: true,
             placed: true,
+            off: 0.0,
             moved: false,
             posterior: None,
             spring,
@@ -173,10 +178,10 @@ impl Blocks {
 
     /// Forget rows and what they have taught: they are of other moments. A lost zero stays lost.
     pub fn relearn(&mut self) {
-        let lost = self.lost;
+        let (lost, located) = (self.lost, self.located);
         self.clear();
         if lost {
-            (self.lost, self.posterior) = (true, None);
+            (self.lost, self.located, self.posterior) = (true, located, None);
         }
     }
 
@@ -186,7 +191,7 @@ impl Blocks {
         self.take_open();
         (self.posterior, self.frame) = (self.spring.declared_posterior(), None);
         (self.skipped, self.fitted) = (0, false);
-        (self.moved, self.placed) = (false, true);
+        (self.moved, self.located, self.placed) = (false, true, true);
         self.end_doubt();
         self.unform();
         (self.noise.variance, self.own, self.quick) = (f64::NAN, f64::NAN, 0.0);
@@ -278,7 +283,7 @@ impl Blocks {
         }
         self.end_doubt();
         self.solve();
-        if self.lost && !self.spring.is_constant() && !self.is_explained() {
+        if self.lost && self.located && self.off == 0.0 && !self.is_explained() {
             self.lose_zero(); // it was located wrongly
         }
         Closed::Added

@@ -38,6 +38,8 @@ pub struct Moment<'a> {
 pub enum Shift {
     /// The link is so many periods late.
     Late(f64),
+    /// The zero is at this deflection, rad.
+    Zero(f64),
     /// The zero is not where it was.
     Lost,
 }
@@ -210,6 +212,13 @@ impl Side {
         self.doubtful && !self.blocks.is_suspected() || self.followed_s > 0.0
     }
 
+    /// Where its deflections are counted from has been moved to near the zero.
+    pub fn recentre(&mut self, theta: f64, phi: f64, torque: f64) {
+        self.restart(theta, phi, torque);
+        self.blocks.recentre();
+        self.balance.forget_range();
+    }
+
     /// Whether a deflection is one that the joint can have.
     #[must_use]
     pub fn is_within(&self, phi: f64) -> bool {
@@ -331,6 +340,10 @@ impl Side {
             Closed::Added => self.usual = self.deflection.motion(),
             Closed::Unexplained | Closed::Reformed => {}
             Closed::Lost => return Some(Shift::Lost),
+        }
+        let off = std::mem::take(&mut self.blocks.off);
+        if off != 0.0 {
+            return Some(Shift::Zero(off));
         }
         if self.doubtful || self.blocks.is_lost() {
             return None; // a zero that is elsewhere looks late

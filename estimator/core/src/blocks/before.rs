@@ -1,18 +1,21 @@
 //! What goes on being known where the sum begins anew, and where a lost zero is.
 //!
-//! After a restart positions may count from anywhere, and the joint may be another one: each of the two joints is held
-//! against the rows by its evidence.
+//! After a restart positions may count from anywhere, and the joint may be another one. Each place of the zero and
+//! each of the two joints is held against the rows by its evidence.
 
 use serde::{Deserialize, Serialize};
 
 use super::Blocks;
-use super::solve::Rows;
-use crate::choices::{DRIFTED, SURE, USEFUL};
-use crate::gram::{Posterior, Prior, Set, UNKNOWNS, Vector, inverse, set};
-use crate::spring::TERMS;
-use crate::unknowns::{CLIPS, DRY, DRY_LATE, ECCENTRIC, INERTIA, LOAD, OFFSET, RATE, SPRING, Spring, ZERO};
+use super::solve::{Rows, rarity};
+use crate::choices::{ACCUSED, DRIFTED, REACHED, SURE, USEFUL};
+use crate::gram::{Gram, Posterior, Prior, Set, UNKNOWNS, Vector, inverse, set, solve};
+use crate::spring::{Projection, TERMS};
+use crate::unknowns::{
+    ACTIVE, CLIPS, DRY, DRY_LATE, ECCENTRIC, INERTIA, LOAD, OFFSET, RATE, SPRING, Spring, ZERO,
+};
 
-const LINEAR: f64 = 12.0; // such a part of the motion is a small step of the zero
+const ZEROS: i32 = 12; // that are tried to either side, over the deflection seen
+const TRIED: usize = 2 * ZEROS as usize + 1;
 
 /// What was known when the sum began anew, α and the zero as they are.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -20,6 +23,7 @@ pub struct Before {
     pub(super) x: Vector,
     pub(super) precision: [Vector; UNKNOWNS],
     pub(super) set: Set,
+    deflection: f64, // the largest, until then
     pub(super) unexplained: f64,
 }
 
@@ -53,6 +57,7 @@ impl Blocks {
             x,
             precision: inverse(&covariance, kept),
             set: kept,
+            deflection: self.deflection,
             unexplained: self.usual_unexplained().min(self.unexplained),
         });
     }
@@ -60,7 +65,7 @@ impl Blocks {
     /// Where the zero between the encoders is, is not known any more.
     pub fn lose_zero(&mut self) {
         let explained = self.is_explained();
-        let found = self.posterior.is_some() && !self.doubting && !self.is_unconfirmed() && explained;
+        let found = self.located && !self.doubting && !self.is_unconfirmed() && explained;
         let guessed = self.zero_torque(self.spring.curve(0.0).1) > USEFUL * self.torque;
         // What was learned without a zero may be of another one.
         let before = self.before.as_ref().filter(|_| self.lost && !found);
@@ -80,11 +85,17 @@ impl Blocks {
         }
         let (before, noise, own) = (self.before.take(), self.noise, self.own);
         self.forget_rows();
-        (self.before, self.lost, self.posterior) = (before, true, None);
+        (self.before, self.lost, self.posterior, self.located) = (before, true, None, false);
         self.spring.zero = 0.0; // deflections are counted from elsewhere
         if self.before.is_some() {
             (self.noise, self.own) = (noise, own);
         }
+    }
+
+    /// The deflections are counted from near the zero, from now on.
+    pub fn recentre(&mut self) {
+        self.lose_zero();
+        self.located = true;
     }
 
     /// Evidence has said where the zero is: it is known when two blocks say so.
@@ -93,7 +104,7 @@ impl Blocks {
     /// that was lost the spring is as it was a block before, `from`: few rows are explained by several zeros, each with a
     /// curve of its own.
     pub(super) fn place_zero(&mut self, moved: bool, step: f64, from: &Spring, chosen: &Posterior) {
-        let near = |step: f64| LINEAR * step.abs() <= self.seen[1] - self.seen[0];
+        let near = |step: f64| f64::from(ZEROS) * step.abs() <= self.seen[1] - self.seen[0];
         let agree = |unknown: usize, step: f64| {
             let before = self.posterior.as_ref().map_or(0.0, |before| before.covariance[unknown][unknown]);
             step * step <= SURE * SURE * (chosen.covariance[unknown][unknown] + before)
@@ -110,6 +121,65 @@ impl Blocks {
             near(step) && moved == self.moved
         };
         self.moved = moved;
+    }
+
+    /// How well a lost zero at each of some places explains the rows, by what was known before and linearised there, and
+    /// where it is then.
+    fn tried(&self, before: &Before, spring: &Spring, total: &Gram, step: f64) -> [(f64, f64); TRIED] {
+        let ([low, high], mut tried) = (self.seen, spring.clone());
+        let middle = 0.5 * (low + high);
+        let powers =
+            set(SPRING.start..SPRING.start + spring.least) | self.before.as_ref().map_or(0, |one| one.set);
+        let asked = ACTIVE & !(set(SPRING) & !powers);
+        let projection = Projection::between(&self.family, self.deflection, low, high);
+        std::array::from_fn(|k| {
+            tried.zero = step * (k as f64 - f64::from(ZEROS)) - middle;
+            let nothing = (f64::NEG_INFINITY, tried.zero);
+            if (tried.zero + low).abs().max((tried.zero + high).abs()) > REACHED * tried.reach() {
+                return nothing;
+            }
+            let frame = tried.frame(&projection);
+            let prior = self.prior_after(Some(before), &tried, total, &frame, self.deflection);
+            let noise = self.noise.variance * self.correlated;
+            solve(&frame.reduce(total), frame.set & asked, &prior, noise)
+                .map_or(nothing, |one| (one.log_evidence, tried.zero + one.x[ZERO]))
+        })
+    }
+
+    /// Where a lost zero is; `None`: all that explain the rows do not agree, be the joint as it was or another one.
+    fn locate(&self, total: &Gram) -> Option<f64> {
+        let (before, [low, high]) = (self.before.as_ref()?, self.seen);
+        let step = before.deflection.max(high - low) / f64::from(ZEROS);
+        let mut found = [[(f64::NEG_INFINITY, 0.0); TRIED]; 2];
+        found[0] = self.tried(before, &self.spring, total, step);
+        if before.knows_spring() {
+            let (other, spring) = self.another(before);
+            found[1] = self.tried(&other, &spring, total, step);
+            found[1].iter_mut().for_each(|one| one.0 -= rarity());
+        }
+        let found = found.as_flattened();
+        let best = found.iter().copied().max_by(|a, b| a.0.total_cmp(&b.0))?;
+        let rival = |one: &(f64, f64)| (one.1 - best.1).abs() > 2.0 * step && one.0 > best.0 - ACCUSED.ln();
+        (best.0.is_finite() && !found.iter().any(rival)).then_some(best.1)
+    }
+
+    /// Whether the balance can be linearised where its zero is.
+    pub(super) fn is_located(&mut self, total: &Gram) -> bool {
+        if !self.lost || self.located || self.spring.is_constant() {
+            return true;
+        }
+        if self.before.is_none() {
+            self.located = true; // near where deflections are counted from, or sought again
+            return true;
+        }
+        let Some(zero) = self.locate(total) else { return false };
+        self.located = true;
+        if zero.abs() > self.deflection / f64::from(ZEROS) {
+            self.off = zero;
+            return false;
+        }
+        self.spring.zero = zero;
+        true
     }
 
     /// The joint after a restart as another one, where that explains the rows better than what was known before.
@@ -168,9 +238,22 @@ mod tests {
         let mut blocks = declared();
         let (mut x, mut precision) = ([0.0; UNKNOWNS], [[0.0; UNKNOWNS]; UNKNOWNS]);
         (x[INERTIA], precision[INERTIA][INERTIA]) = (1e-3, 1e10);
-        let before = Before { x, precision, set: 1 << INERTIA, unexplained: 0.001 };
+        let before = Before { x, precision, set: 1 << INERTIA, deflection: 0.4, unexplained: 0.001 };
         (blocks.before, blocks.lost, blocks.deflection) = (Some(before), true, 0.9);
         blocks
+    }
+
+    #[test]
+    fn a_lost_zero_is_sought_wherever_it_leaves_the_deflections_within_those_known() {
+        let mut blocks = lost();
+        for [low, high] in [[-0.66, -0.32], [-0.05, 0.01], [0.3, 0.5]] {
+            blocks.seen = [low, high];
+            let before = blocks.before.as_ref().unwrap();
+            let step = before.deflection / f64::from(ZEROS);
+            let tried = blocks.tried(before, &blocks.spring, &Gram::default(), step).map(|(_, zero)| zero);
+            assert!(tried[0] < step - before.deflection - low, "{tried:?}");
+            assert!(tried[TRIED - 1] > before.deflection - high - step, "{tried:?}");
+        }
     }
 
     #[test]

@@ -140,7 +140,7 @@ impl Blocks {
         if opens & set(SPRING) != 0 {
             self.spring.open();
         }
-        self.lost |= opens >> ZERO & 1 == 1;
+        (self.lost, self.located) = (self.lost || opens >> ZERO & 1 == 1, true); // it is not far
         self.solve();
     }
 

@@ -135,6 +135,9 @@ impl Blocks {
         self.ring.iter().for_each(|(block, _)| total.add(block, 1.0));
         let torque = balance::variance(&total, balance::TORQUE).max(f64::MIN_POSITIVE);
         self.begin(&total, torque);
+        if !self.is_located(&total) {
+            return;
+        }
         self.fit_projection();
         let Some(projection) = self.projection.clone() else { return };
         let (from, zero) = (self.spring.clone(), if self.lost { self.deflection } else { self.near() });

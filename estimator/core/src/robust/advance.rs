@@ -97,6 +97,7 @@ impl Robust {
         for (i, shift) in shifts.iter().enumerate() {
             match *shift {
                 Some(Shift::Late(periods)) => late = Some(periods),
+                Some(Shift::Zero(off)) => self.recentre(i, off),
                 Some(Shift::Lost) => lost[i] = true,
                 None => {}
             }

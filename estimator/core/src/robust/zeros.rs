@@ -20,6 +20,21 @@ impl Robust {
         }
     }
 
+    /// The zero of one motor has been found so far from where its deflections are counted from.
+    pub(super) fn recentre(&mut self, i: usize, off: f64) {
+        self.count_from(i, off);
+        let at = &self.live.last.at;
+        self.sides[i].recentre(at.motor[i], at.deflection(i), self.live.last.torque[i]);
+    }
+
+    /// Positions of one motor are counted from so far on.
+    fn count_from(&mut self, i: usize, off: f64) {
+        self.live.zeros.motor[i] += off;
+        self.live.last.at.motor[i] -= off;
+        self.live.last.present.motor[i] -= off;
+        self.live.unsettled = self.settle;
+    }
+
     /// Positions may count from anywhere: each motor's from where they did, if blocks bear it out, or from here.
     pub(super) fn resume(&mut self, at: &Positions) {
         let now = at.from_zeros(&self.live.zeros);
@@ -35,15 +50,11 @@ impl Robust {
 
     /// Blocks say that a motor's zero is not where it was before a restart; nor are those of which they say nothing yet.
     pub(super) fn lose_here(&mut self, lost: [bool; MOTORS]) {
-        self.live.unsettled = self.settle;
         for i in 0..self.motors {
             if !lost[i] && !self.sides[i].blocks.is_suspected() {
                 continue;
             }
-            let off = if self.flexible { self.live.last.at.deflection(i) } else { 0.0 };
-            self.live.zeros.motor[i] -= off;
-            self.live.last.at.motor[i] += off;
-            self.live.last.present.motor[i] += off;
+            self.count_from(i, if self.flexible { -self.live.last.at.deflection(i) } else { 0.0 });
             let at = &self.live.last.at;
             self.sides[i].move_zero(false);
             self.sides[i].restart(at.motor[i], at.deflection(i), self.live.last.torque[i]);

@@ -162,7 +162,7 @@ def test_the_age_grows_until_it_is_stale_and_a_daemon_that_hangs_is_not_gone(pub
     put_external(publisher, make_external(1, status=3), time.time_ns())
     until(lambda: publish(publisher, 1) or (impatient.state == "live" and impatient.contact))
     first = impatient.age_s
-    assert first < impatient.age_s
+    until(lambda: impatient.age_s > first)  # one that was put may still have come
     until(lambda: impatient.state == "stale")  # the daemon is there, but says nothing new
     assert impatient.stale and impatient.age_s > STALE_S
     assert impatient.external is None and not impatient.contact

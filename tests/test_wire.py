@@ -112,6 +112,13 @@ def test_any_estimate_can_be_read_by_zenohs_deserializer(sequence, stamp_ns, sta
         assert wire.decode_estimate(payload)[:6] == (sequence, stamp_ns, status, *totals)
 
 
+def test_a_message_says_of_each_number_whether_it_may_be_used():
+    names = ("valid", "torque_valid", "stiffness_valid")
+    for name in names:
+        message = wire.EstimateMessage(1, 0, int(Status[name.upper()]), 0.1, 2.0, 0.1, ())
+        assert [other for other in names if getattr(message, other)] == [name]
+
+
 def test_numpy_reads_the_same_bytes_as_records():
     estimate = Estimate(7, 3, 1.0, 2.0, 3.0, (TransmissionEstimate(4.0, 5.0, 6.0, 7.0),) * 2)
     records = np.frombuffer(encode_estimate(estimate, 9) * 3, wire.ESTIMATE.dtype(2))

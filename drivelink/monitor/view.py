@@ -223,25 +223,25 @@ class JointView:
             table.add_column(no_wrap=True, min_width=least)
         if spark >= 4:
             table.add_column(no_wrap=True, ratio=1)
-        inks = [ESTIMATE if self.live and valid else "dim" for valid in last[-2:]]  # torque, stiffness
         stiffness, half = value_and_interval(last.stiffness_nm_rad, half_interval(estimate))
         band = f" ± {half}" if half else ""
         torque, torque_band = self._torque_and_interval(last.torque_nm)
         rows: list[tuple[RenderableType, ...]] = []
-        for label, value, extra, unit, true, error, series, ink in (
+        for label, value, extra, unit, true, error, series, valid in (
             ("stiffness", stiffness, band, "N·m/rad", last.true_stiffness_nm_rad, self.errors[0],
-             [m.stiffness_nm_rad if m.stiffness_valid else math.nan for m in window], inks[1]),
+             [m.stiffness_nm_rad if m.stiffness_valid else math.nan for m in window], last.stiffness_valid),
             ("torque", torque, torque_band, "N·m", last.true_torque_nm, self.errors[1],
-             [m.torque_nm if m.torque_valid else math.nan for m in window], inks[0]),
+             [m.torque_nm if m.torque_valid else math.nan for m in window], last.torque_valid),
         ):  # fmt: skip
+            ink = ESTIMATE if self.live and valid else "dim"
             truth = Text.assemble(
                 "truth ",
                 (number(true) if label == "stiffness" else self._torque(true), TRUTH),
-                f"  rms error {100 * error:.2f} %" if ink == ESTIMATE and math.isfinite(error) else "",
+                f"  rms error {100 * error:.2f} %" if valid and math.isfinite(error) else "",
             )
             shown = Text.assemble((value, f"bold {ink}"), extra, f" {unit}")
             rows.append((label, shown, truth if known else "", Text(sparkline(series, spark), style=ink)))
-        rows += self._external(spark, ink)
+        rows += self._external(spark, ESTIMATE if self.live and last.torque_valid else "dim")
         several = [number(one.stiffness_nm_rad) for one in estimate.transmissions]
         each = f"each {' | '.join(several)}" if several[1:] and not known else ""
         rows.append(("deflection", f"{self.deflections('   ')} rad", each, ""))

@@ -109,12 +109,12 @@ class EstimateMessage(NamedTuple):
     @property
     def torque_valid(self) -> bool:
         """Status bit 7: the flexibility torque may be used, also where the stiffness may not."""
-        return bool(self.status & (Status.VALID | Status.TORQUE_VALID))
+        return bool(self.status & Status.TORQUE_VALID)
 
     @property
     def stiffness_valid(self) -> bool:
         """Status bit 15: the stiffness may be used, also where the flexibility torque may not."""
-        return bool(self.status & (Status.VALID | Status.STIFFNESS_VALID))
+        return bool(self.status & Status.STIFFNESS_VALID)
 
     @property
     def usable(self) -> bool:

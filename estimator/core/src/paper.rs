@@ -318,10 +318,10 @@ impl Paper {
                 part.update(theta, omega, tau, q, sample.link_velocity, accepted.periods);
             }
         }
-        if self.parts.iter().all(Part::of_use) {
-            flags |= status::USABLE;
-        }
         let flexible = self.parts.iter().any(|part| !part.rigid);
+        if self.parts.iter().all(Part::of_use) {
+            flags |= if flexible { status::USABLE } else { status::VALID | status::TORQUE_VALID };
+        }
         if accepted.periods > 0 && flexible && self.parts.iter().all(|p| p.rigid || p.observable()) {
             flags |= status::OBSERVABLE;
         }

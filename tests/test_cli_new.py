@@ -157,3 +157,8 @@ def test_questions_left_unanswered_are_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin.isatty", lambda: True)
     assert main(["new", str(tmp_path / "elbow.toml")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("encoder", ["drive", "9"])
+def test_no_resolution_is_made_up_that_would_go_before_what_the_encoder_reports(tmp_path, encoder):
+    assert made(tmp_path, "--inertia", "1", "--encoder", encoder).link.encoder.counts_per_rev is None

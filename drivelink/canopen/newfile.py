@@ -163,13 +163,12 @@ def _remark(answers: Answers, node: int) -> str:
 def _link(answers: Answers) -> str:
     if answers.encoder == "none":
         return "[link]\n# no link encoder: only with a rigid transmission\n"
-    encoder = 'source = "drive"  # second encoder of the first drive, 0x60E4:01\n'
-    encoder += "counts_per_rev = 65536  # per joint revolution"
+    encoder, known = 'source = "drive"  # second encoder of the first drive, 0x60E4:01\n', "drive's (0x60E6)"
     if answers.encoder != "drive":
-        node = int(answers.encoder)
+        node, known = int(answers.encoder), "encoder's (0x6501)"
         encoder = 'source = "cia406"  # an encoder that is a node of its own\n'
         encoder += f"node_id = {node}{_remark(answers, node)}\n"
-        encoder += "# counts_per_rev = 65536  # per joint revolution; left out: the encoder's (0x6501)"
+    encoder += f"# counts_per_rev = 65536  # per joint revolution; left out: the {known}"
     return _LINK.format(encoder=encoder)
 
 

@@ -286,6 +286,17 @@ def test_closed_outputs_are_no_traceback():
         assert done.returncode == 0 and done.stdout.startswith(said) and done.stderr == b"", done
 
 
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_results_are_written_also_where_the_reader_of_what_is_printed_has_gone(tmp_path, options):
+    elbow = str(Path(__file__).parent.parent / "examples" / "elbow.toml")
+    reader, writer = os.pipe()
+    os.close(reader)
+    run = [sys.executable, "-m", "drivelink", "compare", elbow, elbow, "--out", str(tmp_path), *options]
+    done = subprocess.run(run, stdout=writer, stderr=subprocess.PIPE, timeout=120)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, b"") and (tmp_path / "comparison.json").exists(), done
+
+
 def test_an_interrupt_while_modules_are_loaded_prints_no_traceback(tmp_path):
     stub = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
     (tmp_path / "argparse.py").write_text(stub)

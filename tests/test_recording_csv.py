@@ -176,7 +176,7 @@ HEAD = "time_s,motor1_position_rad,motor1_torque_nm\n"
         (lambda t: np.column_stack((t[:, 0] ** 2, t[:, 1:])), "expected uniform sampling"),
         (lambda t: np.column_stack((t[:, :2], t[:, 2] * np.nan, t[:, 3])), "motor1_torque_nm holds no numeric value"),
         ("", "expected a CSV file with a line of column names"),
-        ("0,1,2\n3,4,5\n", "expected a header with time_s"),
+        ("0,1,2\n3,4,5\n", "found 0, 1, 2 ([recording.columns] of the joint file says which is which)"),
         ("Zeit [ms];Position Motor 1 [°]\n0;1\n", "found Zeit [ms], Position Motor 1 [°] ("),
         (HEAD.replace("\n", "\r") + "0,1,2\r", "line 1: expected a line feed at its end, got carriage returns alone"),
 

@@ -156,11 +156,16 @@ def _written(status: int) -> bool:
     try:
         sys.stdout.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard()
         if status == 0 and not isinstance(error, BrokenPipeError):
             _fail("", f"standard output: {error.strerror}", 1)
         return False
     return True
+
+
+def _discard() -> None:
+    """Let standard output go nowhere from now on."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _main(argv: list[str] | None) -> int:
@@ -194,7 +199,7 @@ def _main(argv: list[str] | None) -> int:
     except EstimatorError as error:
         return _fail(verb, error, 1)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard()
         return 1
     except OSError as error:
         # What is written to a file names it: without a name it is what was printed.
@@ -273,15 +278,18 @@ def warn(path: Path, lines: Sequence[str]) -> None:
 
 
 def conclude(as_json: bool, content: Mapping[str, Any], sections: Iterable[Section]) -> None:
-    """Print a verb's result: a JSON object alone, or tables."""
-    if as_json:
-        print(json.dumps(content))
-        return
-    from rich.console import Console
+    """Print a verb's result: JSON alone, or tables; a reader that has gone keeps no file from being written."""
+    try:
+        if as_json:
+            print(json.dumps(content), flush=True)
+        else:
+            from rich.console import Console
 
-    from drivelink.output.document import show
+            from drivelink.output.document import show
 
-    show(sections, Console())
+            show(sections, Console())
+    except (BrokenPipeError, SystemExit):  # the latter is rich's
+        _discard()
 
 
 def wrote(as_json: bool, paths: Iterable[Path]) -> None:

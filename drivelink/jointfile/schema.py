@@ -119,7 +119,7 @@ class EncoderSection(_Section):
     source: Literal["drive", "cia406"] = key("drive", "wired to a drive (0x60E4), or a node of its own")
     node_id: int | None = key(None, "its node; left out with a drive: the first motor's", ge=1, le=127)
     object: str | None = key(None, 'position object; default "0x60E4:01" or "0x6004:00"')
-    counts_per_rev: float | None = key(None, "counts per joint revolution (0x60E6, or 0x6501 of CiA 406)", gt=0)
+    counts_per_rev: float | None = key(None, "counts per joint revolution (0x60E6, CiA 406: 0x6501)", gt=0)
     direction: Direction = key(1, "sign against the joint's")
     offset_rad: float = key(0.0, "subtracted from the link position")
     eds: str | None = key(None, "EDS or DCF file, relative to the joint file")

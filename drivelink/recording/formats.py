@@ -123,7 +123,7 @@ def _layout(header: str, path: Path, known: frozenset[str]) -> _Layout:
     if not used:
         raise RecordingError(
             f"{path}: expected a header with time_s, motor1_position_rad, motor1_torque_nm, …, found "
-            f"{some(names, 40)} (--map SOURCE=COLUMN[:UNIT] or [recording.columns] says which is which)"
+            f"{some(names, 40)} ([recording.columns] of the joint file says which is which)"
         )
     if twice := {name for name in names if name and names.count(name) > 1}:
         raise RecordingError(f"{path}: column {min(twice)} appears twice")

@@ -344,7 +344,9 @@ def test_a_daemon_that_is_there_is_listed_and_not_missed(
     assert not caplog.messages
     assert cli.main(["list", "--endpoint", endpoint]) == 0 and capsys.readouterr().out == "elbow\n"
     monkeypatch.setattr("drivelink.pubsub.session._MEETING_S", 0.3)
-    assert cli.main(["list", "--endpoint", free_endpoint()]) == 6
-    assert "drivelink run JOINT starts a daemon" in capsys.readouterr().err
+    there = free_endpoint()
+    assert cli.main(["list", "--endpoint", there]) == 6
+    said = f"nothing answers at {there}: drivelink run JOINT starts a daemon; or a router is missing\n"
+    assert capsys.readouterr().err == said
     assert cli.main(["list", "--endpoint", endpoint, "--prefix", "other"]) == 6
     assert "no joint of prefix 'other' at" in capsys.readouterr().err

@@ -197,6 +197,17 @@ def test_a_configuration_that_cannot_be_used_is_one_line_with_its_file(tmp_path,
     assert ".rs:" not in str(error.value)
 
 
+def test_a_joint_file_in_the_place_of_a_configuration_is_one_line_without_its_text(tmp_path):
+    (tmp_path / "elbow.toml").write_text(zenohkit.joint_text("elbow", "tcp/127.0.0.1:7447"))
+    with pytest.raises(ZenohError) as error:
+        open_client("tcp/127.0.0.1:7447", tmp_path / "elbow.toml")
+    said = f"{tmp_path / 'elbow.toml'}: expected a zenoh configuration (JSON5): unknown field `"
+    assert str(error.value).startswith(said) and str(error.value).endswith("`id`, `metadata`, `mode`, …")
+    (tmp_path / "mine.json5").write_text('{\n mode: "spectator" }')
+    with pytest.raises(ZenohError, match=r"expected one of `router`, `peer`, `client`, line 2$"):
+        open_client("tcp/127.0.0.1:7447", tmp_path / "mine.json5")
+
+
 def test_where_nobody_answers_the_line_is_ours(endpoint, tmp_path):
     text = f'{{ mode: "client", connect: {{ endpoints: ["{endpoint}"] }} }}'
     (tmp_path / "mine.json5").write_text(text)

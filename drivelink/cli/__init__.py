@@ -278,7 +278,7 @@ def warn(path: Path, lines: Sequence[str]) -> None:
 
 
 def conclude(as_json: bool, content: Mapping[str, Any], sections: Iterable[Section]) -> None:
-    """Print a verb's result: JSON alone, or tables; a reader that has gone keeps no file from being written."""
+    """Print a verb's result: JSON alone, or tables; a reader that has gone ends no verb that writes files."""
     try:
         if as_json:
             print(json.dumps(content), flush=True)

@@ -2,9 +2,11 @@
 
 import argparse
 import json
+import re
 import signal
 import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
@@ -26,7 +28,7 @@ from drivelink.monitor.webaccept import WebAcceptance
 from drivelink.monitor.webday import WebDay
 from drivelink.plaintext import stamped
 from drivelink.pubsub.clientbase import PATIENCE_S
-from drivelink.pubsub.session import ENDPOINT, close_session, open_client
+from drivelink.pubsub.session import ENDPOINT, answers, close_session, open_client
 
 _POLL_S = 0.02
 _ABSENT_S = 10.0  # without a daemon, until plain lines end
@@ -111,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
         elif not args.json and can_draw(console := Console()):
             _show(watcher, console, end, f"{prefix}/{name or '*'} at {config or endpoint}")
         else:
-            _print(watcher, end, args, nobody(prefix, config or endpoint))
+            _print(watcher, end, args, lambda: nobody(prefix, config or endpoint))
     return 0
 
 
@@ -193,12 +195,14 @@ def _picture(
 
 
 def nobody(prefix: str, where: Path | str) -> str:
-    """Say that no daemon is there."""
+    """Say that no daemon is there, or not even who would know of one."""
+    if isinstance(where, str) and re.match(r"(?:tcp|tls)/", where) and not answers(where):
+        return f"nothing answers at {where}: drivelink run JOINT starts a daemon; or a router is missing"
     of = "" if prefix == "drivelink" else f" of prefix {prefix!r}"
     return f"no joint{of} at {where}: drivelink run JOINT starts a daemon"
 
 
-def _print(watcher: Watcher, end: float, args: argparse.Namespace, absent: str) -> None:
+def _print(watcher: Watcher, end: float, args: argparse.Namespace, absent: Callable[[], str]) -> None:
     """Print a line or JSON object per joint at each interval; a line only if it says something new.
 
     Raises:
@@ -227,7 +231,7 @@ def _print(watcher: Watcher, end: float, args: argparse.Namespace, absent: str) 
                 said.clear()
         time.sleep(_POLL_S)
     if not seen:
-        hint = next((view.hint for view in watcher.views.values() if view.hint), absent)
+        hint = next((view.hint for view in watcher.views.values() if view.hint), "") or absent()
         raise ZenohError(f"{hint} (waited {now - there:.0f} s)")
 
 

@@ -275,6 +275,10 @@ def one_line(error: BaseException) -> str:
     if nobody := re.match(r"Unable to connect to any of \[(.+?)\](?:[.!]|$)", text):
         refused = ", or not to this certificate" if re.search(r"\b(?:tls|quic)/", nobody[1]) else ""
         return "nobody answers at " + re.sub(r"Single\((.+?)\)", r"\1", nobody[1]) + refused
+    # Of a dump, which may hold all of the file, what is wrong.
+    if said := re.search(r'(?:message: |msg: |Error\()"((?:[^"\\]|\\.)*)"', text):
+        line = "".join(f", line {n}" for n in re.findall(r"\bline: (\d+), column: \d+", text))
+        text = re.sub(r"((?:`\w+`, ){3}).+", r"\1…", said[1]) + line
     return re.sub(r"\s+at /\S+?:\d+\.?(?=\]|\s|$)", "", text)
 
 

@@ -304,7 +304,7 @@ def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_cha
     assert "<h1>1 of 1 joint needs a look: 1 lost</h1>" in text and "<th>why it could not be used" in text
     assert "% of the torque (median)" in text  # also on a phone, which has no head of the table
     assert "a hollow dot a model that was not sufficient" in text
-    assert text.count('class="found"') == 4 and "134.0 % → 2.00 % of the torque" in text
+    assert text.count('class="found"') == 4 and "134.0\u00a0% → 2.00\u00a0% of the torque" in text
 
 
 def test_a_joint_that_breaks_is_still_said_to_lack_what_it_lacked():

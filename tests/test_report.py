@@ -17,7 +17,7 @@ from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.jointfile.apply_diagnosis import floor_entry, make_model_monitor
 from drivelink.output import document, plots, progress, report
-from drivelink.output.document import Document, Grid, Section, page, show
+from drivelink.output.document import Document, Grid, Section, drawn, page, show
 from drivelink.output.numbers import Units
 from drivelink.output.plots import COLORS, PlotCurve, medians, new_figure, over_time, plot_over_time, save, xy
 from drivelink.output.progress import Meter
@@ -193,6 +193,13 @@ def test_words_in_a_page_are_text_without_what_turns_or_hides_them():
     made = page(Document(title=name, about=name, sections=[]))
     assert made.count("&lt;img src=x&gt;]0;own31mgpj.exe") >= 2 and "<img" not in made
     assert for_page(name + '"') == "&lt;img src=x&gt;]0;own31mgpj.exe&quot;"
+
+
+def test_on_a_phone_no_line_ends_within_a_share_and_a_path_has_places_to_break():
+    html = drawn([Grid(("recording", "fit"), [("/plant/night/elbow.csv", "100.0 %"), ("b", "132.5 σ")])])
+    assert (
+        "100.0\u00a0%" in html and "132.5\u00a0σ" in html and "/<wbr>plant/<wbr>night/<wbr>elbow.csv" in html
+    )
 
 
 def test_what_is_not_finite_or_constant_or_empty_can_be_drawn(tmp_path):

@@ -3,6 +3,7 @@
 import html as markup
 import io
 import json
+import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -227,13 +228,14 @@ def _row(cells: tuple[Cell, ...], columns: int) -> str:
         return f'<tr class="over"><th colspan="{columns}">{_escaped(cell_text(cells[0]))}</th></tr>'
     first, *rest = cells
     kind = ' class="chosen"' if cell_text(first).startswith("▶") else ""
-    name = _escaped(cell_text(first)).replace("_", "_<wbr>")
+    name = re.sub("([_/])", r"\1<wbr>", _escaped(cell_text(first)))
     return f"<tr{kind}><th>{name}</th>{''.join(map(_cell, rest))}</tr>"
 
 
 def _cell(cell: Cell) -> str:
     if not isinstance(cell, Share):
-        return f"<td>{_escaped(cell) if isinstance(cell, str) else cell.html}</td>"
+        whole = re.sub(r"(?<=\d) (?=[%σ])", "\u00a0", cell_text(cell))  # no line ends within "100 %"
+        return f"<td>{cell.html if isinstance(cell, Markup) else _escaped(whole)}</td>"
     width = 100.0 * min(max(cell.part, 0.0), 1.0)
     return f'<td class="bar"><i><b style="width:{width:.1f}%"></b></i>{_escaped(cell.text)}</td>'
 

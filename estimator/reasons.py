@@ -66,7 +66,7 @@ def reason_text(
     digits = next((n for n in range(2, 6) if share == asked or f"{share:.{n}g}" != f"{asked:.{n}g}"), 6)
     words = " or ".join(CHANGES[change] for change in changes)
     text = REASONS[name].format(
-        share=f"{100.0 * share:.{digits}g}",
+        share=f"{float(f'{100.0 * share:.{digits}g}'):g}",  # no 1e+02
         asked=100.0 * asked,
         changes=f"{words} has" if words else "the joint has",
     )

@@ -224,6 +224,17 @@ def test_a_verb_warns_with_the_line_that_cures_and_goes_on_and_strict_refuses(
     assert "degrees" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("factors", [{"time": 1000.0}, {"motor1_torque": 1e-6}])
+def test_replay_warns_of_what_fit_warns_of(factors, tmp_path, capsys):
+    drawn = gatekit.draw("soft", 3, seconds=6.0)
+    run, joint = _written(replace(drawn, record=gatekit.faulty(drawn.record, factors)), tmp_path)
+    said = []
+    for verb in ("fit", "replay"):
+        main([verb, str(run), "--joint", str(joint)])
+        said.append([line for line in capsys.readouterr().err.splitlines() if ": warning: " in line])
+    assert said[0] and said[0] == said[1]
+
+
 @pytest.mark.slow
 def test_fit_reports_what_the_motion_does_not_decide(tmp_path, capsys):
     run, joint = _written(gatekit.draw("soft", 4, held=True), tmp_path)

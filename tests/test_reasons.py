@@ -116,6 +116,7 @@ def test_the_sentences_are_those_of_the_documentation():
     assert (
         reason_text("imprecise", share=0.2004, asked=0.2) == "stiffness known to ± 20.04 %, asked for ± 20 %"
     )
+    assert reason_text("unexplained", share=0.9951).startswith("the model leaves 100 % of the")
     text = reason_text("changed", motor=2, changes=["torque_scale", "stiffness"])
     assert text == "motor 2: torque gain or stiffness has changed"
     assert reason_text("changed") == "the joint has changed"

@@ -71,11 +71,11 @@ def _line(joint: JointFile, judgement: Judgement, *, live: bool) -> str:
 
 
 class Gathered:
-    """Keeps the first minute of samples for a later check of units and signs."""
+    """Keeps the samples of a minute for a later check of units and signs."""
 
     def __init__(self, joint: JointFile, period_s: float) -> None:
         self._joint, self._period_s = joint, period_s
-        self._most = round(_LONGEST_S / period_s)
+        self._most = round(_LONGEST_S / joint.bus.period_s)  # the file's may be of another unit
         self._samples: list[Sample] = []
 
     def write(self, played: Played) -> None:
@@ -91,8 +91,7 @@ class Gathered:
                 judgement = judge(record, model)
         except EstimatorError as error:
             return [f"units and signs cannot be checked: {error}"]
-        decided = not judgement.findings and not judgement.undecided
-        return [] if decided else [_line(self._joint, judgement, live=live)]
+        return [line] if (line := _line(self._joint, judgement, live=live)) else []
 
 
 def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float, most: int) -> Record | None:

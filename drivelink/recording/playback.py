@@ -17,7 +17,7 @@ from drivelink._core import Assembler, JointPipeline, Tick
 from drivelink.cycle.pipeline import build
 from drivelink.errors import DrivelinkError, RecordingError, UsageError
 from drivelink.jointfile import JointFile
-from drivelink.output.numbers import with_interval
+from drivelink.output.numbers import number, with_interval
 from drivelink.pubsub.publisher import JointPublisher, finite
 from drivelink.recording import read
 from drivelink.recording.canframes import FrameLog, is_frame_log
@@ -291,7 +291,7 @@ class Summary:
         end = f"; at the end stiffness {stiffness}" if math.isfinite(estimate.stiffness_nm_rad) else ""
         return (
             f"{self.count} cycles, {gaps}{seconds:.6g} s, in {took_s:.3g} s "
-            f"({seconds / max(took_s, 1e-9):.3g} × real time); "
+            f"({number(seconds / max(took_s, 1e-9), 3)} × real time); "
             f"valid {100 * self.valid / self.count:.1f} %, "
             f"observable {100 * self.observable / self.count:.1f} %{end}"
         )

@@ -8,11 +8,11 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from operator import mul
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from drivelink import jointfile
 from drivelink.jointfile import JointFile, JointText
-from drivelink.jointfile.digits import kept, kept_model
+from drivelink.jointfile.digits import kept, kept_model, ten_digits
 from drivelink.version import __version__
 from estimator.effects import LIBRARY, sharpened
 from estimator.errors import EstimatorError
@@ -93,8 +93,8 @@ def write(
             verdict=outcome.verdict,
             effects=[finding.name for finding in outcome.effects],
             bandwidth_hz=outcome.bandwidth_hz,
-            error_before_relative=outcome.validation.before_relative,
-            error_after_relative=outcome.validation.after_relative,
+            error_before_relative=ten_digits(outcome.validation.before_relative),
+            error_after_relative=ten_digits(outcome.validation.after_relative),
         ),
     }
     changes = jointfile.changes_to(model) | {"provenance": provenance}
@@ -114,7 +114,7 @@ def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
     motors = tuple(
         replace(
             motor,
-            **cast("dict[str, Any]", outcome.transmissions[i].motor if _decided(outcome) else {}),
+            **_numbers(outcome, i),
             transmission=_transmission(motor.transmission, outcome, i),
             effects=_all_effects(motor.effects, outcome, i),
         )
@@ -122,6 +122,12 @@ def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
     )
     whole = replace(model, motors=motors, link_effects=_all_effects(model.link_effects, outcome, None))
     return kept_model(whole)
+
+
+def _numbers(outcome: Diagnosis, motor: int) -> dict[str, Any]:
+    """Inertia and damping as found."""
+    numbers = outcome.transmissions[motor].motor if _decided(outcome) else {}
+    return {name: ten_digits(value) for name, value in numbers.items()}
 
 
 def _all_effects(declared: tuple[Effect, ...], outcome: Diagnosis, motor: int | None) -> tuple[Effect, ...]:
@@ -151,7 +157,7 @@ def _readings(outcome: Diagnosis, motor: int | None) -> list[Effect]:
             f"motor{motor + 1}_deflection_offset_rad": ("deflection_offset", "offset_rad"),
         }
     return [
-        Effect(name=name, parameters={parameter: float(outcome.alignment[key])})
+        Effect(name=name, parameters={parameter: ten_digits(outcome.alignment[key])})
         for key, (name, parameter) in places.items()
         if key in outcome.alignment
     ]

@@ -2,7 +2,8 @@
 
 A number is rounded to three digits behind the first one of its standard deviation, so by less than a
 thousandth of that; a deviation likewise. For a transmission's parameters it is the deviation that each has
-where the other ones are known: no combination of them loses more. One without deviation keeps all digits.
+where the other ones are known: no combination of them loses more. What was declared without a deviation
+keeps all digits; what was found without one has ten, those of a reading of 32 bits.
 """
 
 import math
@@ -15,6 +16,7 @@ from estimator.model import Effect, JointModel, LinkDynamics, Motor, ParameterVa
 from estimator.transmissions import transmission_model
 
 _MORE = 3  # digits behind the first of the standard deviation
+_READING = 10  # digits of a number of 32 bits
 
 
 def kept(value: ParameterValue, std: ParameterValue | None) -> Any:
@@ -24,6 +26,11 @@ def kept(value: ParameterValue, std: ParameterValue | None) -> Any:
     if isinstance(std, tuple) or std is None or not 0.0 < std < math.inf:
         return value
     return round(value, _MORE - math.floor(math.log10(std)))
+
+
+def ten_digits(value: float) -> float:
+    """Return a number that was found without a standard deviation, with the digits of a reading."""
+    return float(f"{value:.{_READING}g}")
 
 
 def kept_model(model: JointModel) -> JointModel:

@@ -333,6 +333,9 @@ def test_of_several_daemons_all_are_named():
         absent("elbwo", ["elbow", "knee"])
         == 'no daemon of "elbwo", only of elbow, knee; did you mean "elbow"?'
     )
+    assert absent("toe", []).endswith(
+        "nor of any other joint: drivelink run JOINT starts one; or a router is missing"
+    )
     assert absent("toe", ["knee"]) == 'no daemon of "toe", only of knee'
 
 

@@ -76,7 +76,7 @@ def test_the_contract_s_example_is_read_as_written():
         ("node_id = 1", 'node_id = "x"', "motor[1].drive.node_id: input should be a valid integer, got 'x'"),
         ("node_id = 1", "node_id = 128", "motor[1].drive.node_id: input should be less than or equal to 127, got 128"),
         ('name = "elbow"', "", "name: expected this key, it is missing"),
-        ('name = "elbow"', 'name = "el/bow"', "name: expected letters, digits"),
+        ('name = "elbow"', 'name = "el/bow"', "name: expected letters from a to z, digits"),
         ('"robust"', '"rob"', "estimator.mode: input should be 'robust' or 'paper', got 'rob'"),
         ("gravity_nm", "grav", "link.dynamics.grav: unknown key, expected one of inertia_kg_m2"),
         ('"coulomb_friction"', '"ears"', 'motor[1].effect: effect "ears": expected one of'),

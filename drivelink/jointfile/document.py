@@ -113,7 +113,7 @@ _MARK = "# drivelink wrote this file, and ends it with a check line: a part of i
 _CHECK = re.compile(r"^# drivelink check: sha256 ([0-9a-f]{16})$\n?", re.MULTILINE)
 
 _PATTERNS = {  # in words, by key
-    "name": "letters, digits, '.', '-' and '_', a letter or digit first",
+    "name": "letters from a to z, digits, '.', '-' and '_', a letter or digit first",
     "prefix": "parts of a zenoh key with '/' between, without spaces and without any of *$#?",
 }
 

@@ -73,7 +73,8 @@ def ask(session: zenoh.Session, prefix: str, answer: Callable[[list[str]], None]
 def absent(joint: str, names: Sequence[str]) -> str:
     """Report that a joint has no daemon, and which others have one."""
     if not names:
-        return f'no daemon of "{joint}", nor of any other joint: drivelink run JOINT starts one'
+        none = f'no daemon of "{joint}" answers, nor of any other joint'
+        return f"{none}: drivelink run JOINT starts one; or a router is missing"
     near = difflib.get_close_matches(joint, names, n=1, cutoff=0.5)
     guess = f'; did you mean "{clean_text(near[0], _MOST)}"?' if near else ""
     shown = ", ".join(clean_text(name, _MOST) for name in names[:_SHOWN])

@@ -18,7 +18,7 @@ from drivelink import cli, jointfile
 from drivelink.comparison import compare
 from drivelink.demo.simulate import alter, world_from_joint
 from drivelink.errors import DrivelinkError
-from drivelink.output.comparison import simulated
+from drivelink.output.comparison import Difference, simulated
 from drivelink.output.document import show
 from estimator import Effect, EstimatorError, JointModel, LinkDynamics, Record, Transmission
 from estimator.filters import smoothed
@@ -66,6 +66,12 @@ def test_friction_that_nobody_declared_is_in_the_curve_and_in_the_free_run(runs)
     assert abs(abs(friction.b - friction.a) - 0.6) < 0.1
     (_, declared, fitted) = made.runs[0]
     assert min(fitted.fit_percent.values()) > 99.0 > 90.0 > max(declared.fit_percent.values())
+
+
+def test_two_numbers_beside_each_other_are_in_one_notation():
+    made = compare(ELBOW, ELBOW)
+    row = made._row(Difference(1, "friction", 0.02, 9e-5, 0.00386, 4.8e-4))
+    assert row[1:3] == ("0.00009", "0.00386")
 
 
 def test_the_verb_writes_a_page_and_numbers(runs, capsys):

@@ -157,7 +157,8 @@ class Comparison:
         unit = self.units.shown("(N·m/rad)" if one.kind == "stiffness" else "N·m")
         apart = f"{abs(one.b - one.a) / one.std:.1f} σ" if one.std > 0.0 else "–"
         at = f"{number(one.at, 3)} {self.units.shown('rad' if one.kind == 'stiffness' else 'rad/s')}"
-        a, b = (value_and_interval(value, SIGMA_95 * one.std)[0] for value in (one.a, one.b))
+        both = one.a, one.b
+        a, b = (value_and_interval(x, SIGMA_95 * one.std, max(map(abs, both)))[0] for x in both)
         return (f"{one.kind} / {unit}", a, b, at, apart)
 
     def _over(self, side: Side, runs: Sequence[FreeRun]) -> Figure:

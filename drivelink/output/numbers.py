@@ -98,11 +98,12 @@ def _to_place(value: float, largest: float, last: int) -> str:
     return f"{text}e{power}".replace("-", "−") if power else text.replace("-", "−")
 
 
-def value_and_interval(value: float, half: float | None) -> tuple[str, str]:
+def value_and_interval(value: float, half: float | None, beside: float = 0.0) -> tuple[str, str]:
     """Return a value to the last digit that its interval leaves, and half its interval with two digits.
 
     Args:
         half: half the width of its interval; None, zero or not finite: unknown.
+        beside: the largest number that is read beside it, in whose notation it is.
 
     Returns:
         Both texts, the second empty where unknown: ("0.0974", "0.0064"), ("0.000", "0.027").
@@ -110,7 +111,7 @@ def value_and_interval(value: float, half: float | None) -> tuple[str, str]:
     if not math.isfinite(value) or half is None or not math.isfinite(half) or half <= 0.0:
         return number(value), ""
     last = int(f"{half:.1e}".partition("e")[2]) - 1  # power of ten of the interval's second digit
-    power, largest = 0, max(abs(value), half)
+    power, largest = 0, max(abs(value), half, beside)
     if not 1e-3 <= largest < 1e6:
         power = math.floor(math.log10(round(largest, -last)))
     decimals = power - last

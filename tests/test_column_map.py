@@ -141,6 +141,8 @@ def test_what_a_mapping_asks_for_in_vain_is_one_line(tmp_path):
     open_sink(tmp_path / "r.mcap", JOINT).close()
     with pytest.raises(UsageError, match="only CSV files have columns to be named"):
         read(tmp_path / "r.mcap", JOINT, names=names)
+    with pytest.raises(UsageError, match=r"rig.csv: --frames: expected a raw CAN log, this one has samples"):
+        open_playback(tmp_path / "rig.csv", JOINT, tmp_path, frames=True)
     with pytest.raises(UsageError, match=r"rig.csv: --channel: expected a raw CAN log, this one has samples"):
         open_playback(tmp_path / "rig.csv", JOINT, tmp_path, channel="can1")
 

@@ -91,13 +91,13 @@ def open_playback(
 
     Raises:
         RecordingError: it cannot be read, or is incomplete.
-        UsageError: `channel` for what is no raw CAN log.
+        UsageError: `channel` or `frames` for what is no raw CAN log.
     """
     if is_frame_log(path, frames):
         log = FrameLog(path, joint, base_dir, channel)
         return Playback(joint, log.period_s, None, lambda _: log.cycles())
-    if channel is not None and path.exists():
-        raise UsageError(f"{path}: --channel: expected a raw CAN log, this one has samples")
+    if (option := "--channel" if channel is not None else "--frames" if frames else "") and path.exists():
+        raise UsageError(f"{path}: {option}: expected a raw CAN log, this one has samples")
     if path.suffix.lower() == ".mcap":
         warn_of_another(path, joint.name)
         recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import socket
 import struct
 
 import pytest
@@ -17,15 +18,15 @@ async def listened(port, topic):
     protocol = ("foxglove.sdk.v1",)
     async with (
         aiohttp.ClientSession() as session,
-        session.ws_connect(f"ws://127.0.0.1:{port}", protocols=protocol) as socket,
+        session.ws_connect(f"ws://127.0.0.1:{port}", protocols=protocol) as connection,
     ):
         channels = {}
         while topic not in channels:
-            message = await socket.receive_json()
+            message = await connection.receive_json()
             channels |= {one["topic"]: one for one in message.get("channels", ())}
         wanted = {"id": 7, "channelId": channels[topic]["id"]}
-        await socket.send_json({"op": "subscribe", "subscriptions": [wanted]})
-        while (message := await socket.receive()).type is not aiohttp.WSMsgType.BINARY or message.data[
+        await connection.send_json({"op": "subscribe", "subscriptions": [wanted]})
+        while (message := await connection.receive()).type is not aiohttp.WSMsgType.BINARY or message.data[
             0
         ] != 1:
             pass
@@ -44,6 +45,11 @@ def test_estimates_come_live_over_a_websocket(tmp_path):
             _, model, topics = asyncio.run(asyncio.wait_for(listened(port, "/elbow/model"), 20))
             with process("monitor", path, "--foxglove", "--port", str(port)) as second:
                 said = second.stderr.read()
+            with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
+                client.sendall(b"no handshake\r\n\r\n")
+                client.recv(1000)  # it is dropped
+            bridge.terminate()
+            assert bridge.wait(20) == 0 and bridge.stderr.read() == ""
     assert said.startswith(f"drivelink monitor: --port {port}: cannot be served: Failed to bind port")
     assert topics >= {"/elbow/model", "/elbow/estimate"}
     assert not topics & {"/elbow/can", "/elbow/mapping", "/elbow/joint"}  # nobody sends them

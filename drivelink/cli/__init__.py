@@ -171,8 +171,9 @@ def _discard() -> None:
 def _main(argv: list[str] | None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     verb = argv[0] if argv and argv[0] in VERBS else ""
-    # Some interfaces log every partial read, or a traceback for what they also raise.
-    logging.getLogger("can").setLevel(logging.CRITICAL)
+    # Interfaces log every partial read, or a traceback for what they also raise; the bridge each client lost.
+    for name in ("can", "foxglove"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(PlainFormatter())
     spell_out()

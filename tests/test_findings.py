@@ -294,6 +294,14 @@ def test_what_an_effect_adds_to_a_covariance_is_symmetric():
     assert np.array_equal(added, added.T) and np.any(added)
 
 
+@pytest.mark.parametrize(("gain", "share"), [(4.0, 1.0), (0.0, 1.0), (-3.0, np.exp(-3.0)), (-np.inf, 0.0)])
+def test_an_effect_that_the_motion_shows_to_be_absent_adds_nothing_to_an_interval(gain, share):
+    """As likely as not before the data: what these cannot tell counts in full, what they rule out does not."""
+    shift, precision, side = np.array([[2.0]]), np.array([[4.0]]), np.array([1.0])
+    tried = _Tried(Candidate(LIBRARY["backlash"], 0), {}, 1, gain, shift, precision, side)
+    assert tried.covariance[0, 0] == pytest.approx(share * 2.0**2 / 4.0)
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_a_number_is_no_effect_within_the_deviation_that_the_joint_file_knows(known):
     (record,), model = kit.World([{}]).run(), kit.model()

@@ -75,11 +75,11 @@ class _Tried(NamedTuple):
 
     @property
     def covariance(self) -> FloatArray:
-        """(k, k) increase of the covariance of x."""
+        """(k, k) increase of the covariance of x, times the odds that the data leave it, at most once."""
         if not math.isfinite(self.gain):
             return np.zeros((self.shift.shape[1],) * 2)
         made = self.shift.T @ np.linalg.solve(self.precision, self.shift)
-        return np.asarray(0.5 * (made + made.T))
+        return np.asarray(math.exp(min(self.gain, 0.0)) * 0.5 * (made + made.T))
 
     @property
     def change(self) -> FloatArray:
@@ -292,10 +292,11 @@ class Search:
         A rejected effect may still be present if the motion does not separate it: a gear with losses that is
         always driven in one direction looks like a softer spring. It adds the covariance of the larger model
         minus that of the hypothesis (consider covariance; S. F. Schmidt, Advances in Control Systems 3,
-        1966). Families of effects are independent contributions (JCGM 100, 5.1.2); of the laws of one family
-        the largest contribution counts. An effect that the data support also changes x: fitted beside the
-        rest, as a linear step would shrink the torque that a drive's effect explains. The squares of these
-        changes are added by the hypotheses' weights (`Held.weights`), as the residual has one explanation.
+        1966): as likely as not before the data, times the odds that they leave it. Families of effects are
+        independent contributions (JCGM 100, 5.1.2); of the laws of one family the largest contribution
+        counts. An effect that the data support also changes x: fitted beside the rest, as a linear step
+        would shrink the torque that a drive's effect explains. The squares of these changes are added by the
+        hypotheses' weights (`Held.weights`), as the residual has one explanation.
 
         Args:
             parent: the hypothesis.

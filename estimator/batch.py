@@ -135,6 +135,10 @@ class JointFit(NamedTuple):
             j for j, s in enumerate(self.fitted.slots) if s.kind == "everyday" and (s.name, s.motor) == key
         ]
 
+    def spring(self, motor: int) -> list[int]:
+        """Return the columns of a transmission's parameters."""
+        return _spring_columns(self.fitted, motor)
+
     def values(self, key: Key) -> FloatArray:
         """Return the estimated error beyond the declared value, in the same order."""
         mine = self.places(key)

@@ -133,13 +133,17 @@ def _effects(
     flexible = motor is None or joint.problem.model.motors[motor].flexible
     for name, parameter in _PARAMETER.items():
         mine = joint.places((name, motor))
-        if not mine or not joint.supports((name, motor)) or (flexible and name == "coulomb_friction"):
+        zero, supported = name == "deflection_offset", joint.supports((name, motor))
+        if not mine or not (supported or zero) or (flexible and name == "coulomb_friction"):
             continue
-        more = _shared(joint, mine)
+        # At the deflections that were seen the torque is known better than a curve and its zero.
+        more = _shared(joint, mine, joint.spring(motor or 0) if zero else [])
         if more is None:
             each = ", ".join(f"{x:.3g}" for x in joint.values((name, motor)))
             notes.append(f"{name} differs between the recordings ({parameter} {each}) and stays as declared")
             continue
+        if not supported:  # a zero is somewhere: how near to the declared one, is written all the same
+            more = 0.0, math.hypot(*more)
         before = sum(v[parameter] for e in declared if e.name == name for v in elements(e)[1])
         values_of, std = {parameter: before + more[0]}, {parameter: more[1]}
         if name == "coulomb_friction":
@@ -165,10 +169,17 @@ def _believed(joint: JointFit, model: JointModel) -> list[str]:
     return [f"the inertia of {' and '.join(said)} is the declared one: these recordings say less about it"]
 
 
-def _shared(joint: JointFit, mine: list[int]) -> tuple[float, float] | None:
-    """The common value of all recordings and its standard deviation; None if they contradict each other."""
+def _shared(joint: JointFit, mine: list[int], given: list[int]) -> tuple[float, float] | None:
+    """The common value of all recordings, and its standard deviation beside what other columns tell of it;
+    None if the recordings contradict each other.
+    """
     values = np.array([joint.fitted.slots[j].taken + joint.fitted.posterior.x[j] for j in mine])
-    precision = np.linalg.pinv(joint.covariance[np.ix_(mine, mine)], hermitian=True)
+    known = joint.fitted.posterior.covariance
+    both = known[np.ix_(mine, given)]
+    told = np.diag(both @ np.linalg.pinv(known[np.ix_(given, given)], hermitian=True) @ both.T)
+    share = np.sqrt(np.maximum(1.0 - told / np.diag(known)[mine], 0.0))
+    covariance = joint.covariance[np.ix_(mine, mine)] * np.outer(share, share)
+    precision = np.linalg.pinv(covariance, hermitian=True)
     mean = float(np.sum(precision @ values) / np.sum(precision))
     apart = values - mean
     freedom = len(mine) - 1

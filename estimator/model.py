@@ -176,6 +176,12 @@ class Motor:
         """Whether its transmission deflects."""
         return self.transmission.model != "none"
 
+    @property
+    def zero_std_rad(self) -> float:
+        """Standard deviation of the zero between the encoders, where it has been fitted; else 0."""
+        zeros = (one.std.get("offset_rad", 0.0) for one in self.effects if one.name == "deflection_offset")
+        return float(np.linalg.norm([np.linalg.norm(std) for std in zeros]))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkDynamics:

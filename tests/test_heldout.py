@@ -110,10 +110,13 @@ def test_a_larger_motion_alone_is_no_error_of_the_model_and_too_short_data_are_r
 
 
 def test_a_zero_within_its_own_uncertainty_is_none_of_the_machine(model):
-    """Another recording, whose encoders began elsewhere, is not moved by it."""
+    """Another recording, whose encoders began elsewhere, is not moved by it; how near it is, is written."""
     found = identify(record(SOFT), model)
-    assert abs(found.fits[0].deflection_offset_rad) < found.fits[0].nuisance_std["shift"]
-    assert found.model.motors[0].effects == ()
+    value, std = found.fits[0].deflection_offset_rad, found.fits[0].nuisance_std["shift"]
+    assert abs(value) < std
+    (effect,) = found.model.motors[0].effects
+    assert (effect.name, effect.parameters) == ("deflection_offset", {"offset_rad": 0.0})
+    assert abs(value) < found.model.motors[0].zero_std_rad <= np.hypot(value, std)
 
 
 def test_fit_widens_by_what_each_recording_shows_when_left_out(model):

@@ -157,7 +157,11 @@ def _readings(outcome: Diagnosis, motor: int | None) -> list[Effect]:
             f"motor{motor + 1}_deflection_offset_rad": ("deflection_offset", "offset_rad"),
         }
     return [
-        Effect(name=name, parameters={parameter: ten_digits(outcome.alignment[key])})
+        Effect(
+            name=name,
+            parameters={parameter: ten_digits(outcome.alignment[key])},
+            std={parameter: outcome.alignment_std[key]} if key in outcome.alignment_std else {},
+        )
         for key, (name, parameter) in places.items()
         if key in outcome.alignment
     ]

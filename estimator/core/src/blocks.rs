@@ -17,12 +17,12 @@ use before::Before;
 use crate::balance;
 use crate::causes::{Noise, Odds};
 use crate::choices::{BLOCK_S, BLOCKS, CONVINCING, EARLY, FEWEST, LOOK_S, TAILS};
-use crate::gram::{Frame, Gram, Posterior, Row, Vector, inverse};
+use crate::gram::{Frame, Gram, Posterior, Row, UNKNOWNS, Vector, inverse, set};
 use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection};
 use crate::student::f_quantile;
-use crate::unknowns::{ACTIVE, Spring};
+use crate::unknowns::{ACTIVE, LATE, SPRING, Spring, ZERO};
 
 /// What a block did.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -185,11 +185,21 @@ impl Blocks {
         }
     }
 
+    /// What is known from the file alone, of deflections that are read elsewhere and late as usual; `None`: it says
+    /// nothing of its precision.
+    fn declared(&self) -> Option<Posterior> {
+        let mut covariance = self.spring.declared_covariance()?;
+        covariance[ZERO][ZERO] = self.near().hypot(self.motor.zero_std).powi(2);
+        covariance[LATE][LATE] = (self.priors.encoder_delay * self.period).powi(2);
+        let known = set(SPRING.start..SPRING.start + self.spring.least) | 1 << ZERO | 1 << LATE;
+        Some(Posterior::believed(known, [0.0; UNKNOWNS], covariance))
+    }
+
     fn forget_rows(&mut self) {
         self.ring.clear();
         self.waiting.clear();
         self.take_open();
-        (self.posterior, self.frame) = (self.spring.declared_posterior(), None);
+        (self.posterior, self.frame) = (self.declared(), None);
         (self.skipped, self.fitted) = (0, false);
         (self.moved, self.located, self.placed) = (false, true, true);
         self.end_doubt();
@@ -293,7 +303,7 @@ impl Blocks {
     fn believe(&mut self, block: &Gram) {
         let Some(projection) = self.projection.clone() else { return };
         let frame = self.spring.frame(&projection);
-        let prior = self.prior(block, &frame, self.near());
+        let prior = self.prior(block, &frame, self.near().hypot(self.motor.zero_std));
         let known = frame.set & ACTIVE;
         let covariance = inverse(&prior.precision, known);
         self.noise.variance = self.early(block);

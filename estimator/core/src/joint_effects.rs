@@ -95,8 +95,16 @@ mod tests {
             covariance: None,
         };
         let (inertia_std, damping_std, fit_rms) = (None, None, None);
-        let motor =
-            Motor { inertia: 0.1, inertia_std, damping: 0.0, damping_std, fit_rms, transmission, effects };
+        let motor = Motor {
+            inertia: 0.1,
+            inertia_std,
+            damping: 0.0,
+            damping_std,
+            zero_std: 0.0,
+            fit_rms,
+            transmission,
+            effects,
+        };
         Model { arrangement: Arrangement::Single, motors: vec![motor], link: None, link_effects }
     }
 

@@ -50,6 +50,8 @@ pub struct Motor {
     pub damping: f64,
     /// Standard deviation of D_θ, N·m·s/rad, where it is declared.
     pub damping_std: Option<f64>,
+    /// Standard deviation of the zero between the encoders, rad, where it is fitted; else 0.
+    pub zero_std: f64,
     /// rms of what the model leaves of the torque where it is fitted to a recording, and of that torque, N·m.
     pub fit_rms: Option<(f64, f64)>,
     /// See [`Transmission`].
@@ -149,7 +151,16 @@ impl Motor {
     /// One without effects, of which nothing more is declared.
     pub fn bare(inertia: f64, damping: f64, transmission: Transmission) -> Motor {
         let (inertia_std, damping_std, fit_rms) = (None, None, None);
-        Motor { inertia, inertia_std, damping, damping_std, fit_rms, transmission, effects: vec![] }
+        Motor {
+            inertia,
+            inertia_std,
+            damping,
+            damping_std,
+            zero_std: 0.0,
+            fit_rms,
+            transmission,
+            effects: vec![],
+        }
     }
 }
 

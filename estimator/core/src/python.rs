@@ -101,6 +101,8 @@ struct MotorFields {
     damping: f64,
     #[pyo3(attribute("viscous_damping_std_nm_s_rad"))]
     damping_std: Option<f64>,
+    #[pyo3(attribute("zero_std_rad"))]
+    zero_std: f64,
     #[pyo3(attribute("fit_rms_nm"))]
     fit_rms: Option<(f64, f64)>,
     #[pyo3(from_py_with = transmission)]
@@ -145,9 +147,17 @@ fn declared_model(joint: &Bound<'_, PyAny>) -> PyResult<Model> {
     let fields = joint.extract().map_err(|error| reason(joint.py(), error));
     let JointFields { arrangement, motors, link, link_effects } = fields?;
     let motor = |motor: MotorFields| {
-        let MotorFields { inertia, inertia_std, damping, damping_std, fit_rms, transmission, effects } =
-            motor;
-        Motor { inertia, inertia_std, damping, damping_std, fit_rms, transmission, effects }
+        let MotorFields {
+            inertia,
+            inertia_std,
+            damping,
+            damping_std,
+            zero_std,
+            fit_rms,
+            transmission,
+            effects,
+        } = motor;
+        Motor { inertia, inertia_std, damping, damping_std, zero_std, fit_rms, transmission, effects }
     };
     let link = link.map(|LinkFields { inertia, damping, gravity, gravity_phase, std }| {
         let (inertia_std, damping_std, gravity_std) = std;

@@ -59,6 +59,7 @@ fn model(law: Law, parameters: Vec<f64>, effects: bool) -> Model {
         inertia_std: None,
         damping: 0.02,
         damping_std: None,
+        zero_std: 0.0,
         fit_rms: None,
         transmission: Transmission::Elastic { law, order: None, parameters, covariance: None },
         effects: if effects { elements(false) } else { Vec::new() },

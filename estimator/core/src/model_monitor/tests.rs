@@ -14,6 +14,7 @@ fn model(effects: Vec<Element>) -> Model {
             inertia_std: None,
             damping: 0.5,
             damping_std: None,
+            zero_std: 0.0,
             fit_rms: None,
             transmission: Transmission::Elastic {
                 law: Law::Linear,

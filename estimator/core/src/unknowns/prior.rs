@@ -68,7 +68,7 @@ impl Spring {
 
     /// With the covariance of what is declared, where it is and holds.
     fn with_declared(&self, mut prior: Prior) -> Prior {
-        if let Some(covariance) = self.covariance.filter(|_| self.anchored) {
+        if let Some(covariance) = self.declared_covariance() {
             let precision = inverse(&covariance, set(SPRING.start..SPRING.start + self.least));
             for i in SPRING.take(self.least) {
                 prior.precision[i] = precision[i];

@@ -102,8 +102,8 @@ NUMERIC = {
     "sample_validator/channels.rs MOVING": "a change in each of the last five samples is motion, one now and then none",
     "sample_validator/channels.rs SINGLE": "what single precision leaves of them",
     "spring.rs RIDGE": "keeps rounding from deciding between parallel functions",
-    "unknowns.rs NARROWEST": "end of a grid of shapes that is refined afterwards",
-    "unknowns.rs WIDEST": "the other end",
+    "unknowns/starts.rs NARROWEST": "end of a grid of shapes that is refined afterwards",
+    "unknowns/starts.rs WIDEST": "the other end",
 }
 
 

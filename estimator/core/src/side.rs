@@ -217,6 +217,7 @@ impl Side {
         self.restart(theta, phi, torque);
         self.blocks.recentre();
         self.balance.forget_range();
+        self.balance.size.deflection = 0.0; // those before were as large as the zero was far
     }
 
     /// Whether a deflection is one that the joint can have.

@@ -3,6 +3,7 @@
 mod candidates;
 mod prior;
 mod reading;
+mod starts;
 
 use serde::{Deserialize, Serialize};
 
@@ -11,7 +12,7 @@ pub use reading::Reading;
 
 use crate::balance;
 use crate::choices::REACHED;
-use crate::gram::{COLUMNS, Frame, Gram, Matrix, Posterior, Row, Set, UNKNOWNS, Vector, set};
+use crate::gram::{COLUMNS, Frame, Gram, Matrix, Row, Set, UNKNOWNS, Vector, set};
 use crate::laws::{Alpha, Law, PARAMETERS};
 use crate::model::{Motor, Transmission};
 use crate::spring::{Coefficients, FIRST, NODES, Projection, TERMS};
@@ -57,9 +58,6 @@ pub const ECCENTRIC: std::ops::Range<usize> = 29..31;
 pub const ACTIVE: Set = (1 << TORQUE_LATE) - 2;
 
 const USUAL: usize = 2; // powers that springs of which nothing is declared have
-const SHAPES: usize = 12; // of a law that are tried before any is known
-const NARROWEST: f64 = 0.05; // of them: the bend that a shape makes over the deflection seen …
-const WIDEST: f64 = 6.0; // … and the largest
 
 /// What the priors of zero, shape and delay are measured by.
 #[derive(Clone, Copy, Debug)]
@@ -172,6 +170,12 @@ impl Spring {
         if self.series { set(SPRING) | set(CORNER) } else { set(SPRING) }
     }
 
+    /// Whether nothing is declared of it, not even an order.
+    #[must_use]
+    pub fn is_open(&self) -> bool {
+        self.series
+    }
+
     /// Whether these unknowns hold more powers than are declared.
     #[must_use]
     pub fn is_longer(&self, of: Set) -> bool {
@@ -231,12 +235,10 @@ impl Spring {
         }
     }
 
-    /// What is known from the file alone; `None`: it says nothing of its precision.
+    /// Covariance that the file states of the law's parameters; `None`: none, or it holds no more.
     #[must_use]
-    pub fn declared_posterior(&self) -> Option<Posterior> {
-        let covariance = self.covariance.filter(|_| self.anchored)?;
-        let known = set(SPRING.start..SPRING.start + self.least);
-        Some(Posterior::believed(known, [0.0; UNKNOWNS], covariance))
+    pub fn declared_covariance(&self) -> Option<Matrix> {
+        self.covariance.filter(|_| self.anchored)
     }
 
     /// α that the deviations are counted from.
@@ -272,29 +274,6 @@ impl Spring {
         self.zero += x[ZERO];
         self.corner = x[CORNER.start] / size.powi(2);
         self.known = true;
-    }
-
-    /// Whether nothing is declared of a law's shape.
-    #[must_use]
-    pub fn is_searched(&self) -> bool {
-        !self.anchored && !self.law.shapes().is_empty()
-    }
-
-    /// A usual shape parameter above its least value: an angle's of the VSA-II, else of a bend over this deflection.
-    fn bend_scale(&self, deflection: f64) -> f64 {
-        if matches!(self.law, Law::VsaII) { 1.0 } else { deflection.recip() }
-    }
-
-    /// The shapes from which a law of one shape parameter may begin.
-    pub fn starts(&self, deflection: f64) -> impl Iterator<Item = f64> {
-        let shape = self.law.shapes().first().copied().filter(|_| self.size == 2);
-        let (law, scale) = (self.law.clone(), self.bend_scale(deflection));
-        (0..SHAPES).filter_map(move |k| {
-            let shape = shape?;
-            let bend = NARROWEST * (WIDEST / NARROWEST).powf(k as f64 / (SHAPES - 1) as f64);
-            let value = (shape.low + bend * scale).min(shape.high);
-            (law.reach(&[value]) > deflection).then_some(value)
-        })
     }
 
     /// What each unknown adds to a row.

@@ -72,20 +72,38 @@ impl Blocks {
     #[must_use]
     pub fn zero_torque(&self, stiffness: f64) -> f64 {
         let Some(known) = self.posterior.as_ref().filter(|_| !self.lost) else { return 0.0 };
-        let bending = set(STOPS) | set(CLIPS) | set(CORNER) | set(ASYMMETRY);
-        let std = |power: usize| known.covariance[SPRING.start + power][SPRING.start + power].sqrt();
-        let bent = |power: usize| self.spring.alpha[power].abs() > SURE * std(power);
-        let unsure = self.spring.law.is_polynomial() && !(1..self.spring.size).any(bent);
+        let unsure = self.spring.law.is_polynomial() && !self.is_surely_bent();
         // A line's zero is only moved where its torque is far beyond what a reading is off by: it is no guess then.
         let straight = unsure && !(self.moved && self.spring.is_constant());
         let both_sides = !self.spring.is_searched() || self.is_on_both_sides();
-        let bends = known.set & bending != 0 || self.spring.is_longer(known.set);
         let before = self.before.as_ref().is_some_and(|before| before.set >> ZERO & 1 == 1);
-        let told = both_sides && !bends && (before || self.ring.len() > FEWEST);
+        let told = both_sides && !self.is_uneven() && (before || self.ring.len() > FEWEST);
         if !straight && told {
             return 0.0;
         }
         known.x[OFFSET].abs().max(if self.moved { (stiffness * self.spring.zero).abs() } else { 0.0 })
+    }
+
+    /// Whether a lost zero is where a curve bends that may as well be straight, or of any shape.
+    #[must_use]
+    pub fn is_zero_guessed(&self) -> bool {
+        let told = self.before.as_ref().is_some_and(|before| before.set >> OFFSET & 1 == 1);
+        let plain = self.is_surely_bent() && !self.is_uneven();
+        self.lost && !told && self.spring.law.is_polynomial() && !plain
+    }
+
+    /// Whether a series has a further power that is sure.
+    fn is_surely_bent(&self) -> bool {
+        let Some(known) = &self.posterior else { return false };
+        let std = |power: usize| known.covariance[SPRING.start + power][SPRING.start + power].sqrt();
+        (1..self.spring.size).any(|power| self.spring.alpha[power].abs() > SURE * std(power))
+    }
+
+    /// Whether effects bend the curve as another zero would.
+    fn is_uneven(&self) -> bool {
+        let bending = set(STOPS) | set(CLIPS) | set(CORNER) | set(ASYMMETRY);
+        let chosen = self.posterior.as_ref().map_or(0, |known| known.set);
+        chosen & bending != 0 || self.spring.is_longer(chosen)
     }
 
     /// rms of what is left of the balance, over that of the measured torque without its mean; NaN before any.
@@ -124,6 +142,7 @@ impl Blocks {
         let chosen = self.posterior.as_ref().map_or(0, |posterior| posterior.set & !set(TORQUE_LATE..SOFT));
         let named = CANDIDATES.iter().filter(move |c| chosen & set(c.unknowns.clone()) != 0).map(|c| c.name);
         let longer = self.spring.is_longer(chosen).then_some("higher_order_stiffness");
-        named.chain(longer).chain(self.moved.then_some("deflection_offset"))
+        let elsewhere = self.moved || self.lost && self.before.is_none();
+        named.chain(longer).chain(elsewhere.then_some("deflection_offset"))
     }
 }

@@ -3,14 +3,15 @@
 use super::Blocks;
 use super::before::{Before, anywhere};
 use crate::balance;
-use crate::choices::{EXACT, FEWEST, SURE};
+use crate::choices::{EXACT, FEWEST, SURE, USEFUL};
 use crate::gram::{
     COLUMNS, Frame, Gram, Posterior, Prior, Reduced, Row, Set, UNKNOWNS, choose, dot, log_evidence, set,
     solve, unknowns,
 };
 use crate::laws::{Law, PARAMETERS};
+use crate::spring::Projection;
 use crate::unknowns::{
-    ACTIVE, ASYMMETRY, CANDIDATES, CLIPS, DRY, DRY_LATE, ECCENTRIC, OFFSET, RATE, SPRING, STOPS, Scale,
+    ACTIVE, ASYMMETRY, CANDIDATES, CLIPS, DRY, DRY_LATE, ECCENTRIC, LATE, OFFSET, RATE, SPRING, STOPS, Scale,
     Spring, ZERO,
 };
 
@@ -54,28 +55,53 @@ impl Blocks {
         prior
     }
 
-    /// Start a law of which nothing is known where the evidence is best.
+    /// Start a law with a shape where the evidence is best: any shape, if none is declared. Of any law that surely bends the
+    /// zero may be in the middle of the deflections, as of encoders that count from anywhere.
     fn start(&mut self, total: &Gram, noise: f64) {
-        let Some(projection) = &self.projection else { return };
-        let mut best: Option<(f64, f64)> = None;
-        let (spring, mut tried) = (self.spring.clone(), self.spring.clone());
+        let ([low, high], spring) = (self.seen, &self.spring);
+        let (middle, shaped) = (-0.5 * (low + high), !spring.law.shapes().is_empty());
+        let projection = Projection::between(&self.family, self.deflection, low, high);
         let scale = Scale { zero_std: 1.0, deflection: self.deflection, period_s: self.period };
-        for shape in spring.starts(self.deflection) {
-            (tried.alpha[0], tried.alpha[1]) = (1.0, shape);
-            let frame = tried.frame(projection);
-            // With a k of 1 the law's torque is its own slope by k: the deviation is k − 1.
-            let base = frame.set & (set(1..SPRING.start + 1));
+        // The evidence of a spring that has these unknowns, the spring with its k, and the variance that it leaves.
+        let tried = |mut tried: Spring, asked: Set, noise: f64| {
+            let frame = tried.frame(&projection);
             let prior = tried.prior(&self.motor, &self.priors, total, &frame, &scale);
-            let reduced = frame.reduce(total);
-            let log = log_evidence(&reduced, base, &prior, noise);
-            let Some(found) = solve(&reduced, base, &prior, noise) else { continue };
-            let k = 1.0 + found.x[SPRING.start];
-            if k > 0.0 && best.is_none_or(|(most, _)| log > most) {
-                best = Some((log, shape));
-                (self.spring.alpha[0], self.spring.alpha[1]) = (k, shape);
+            let found = solve(&frame.reduce(total), frame.set & (asked | 1 << LATE), &prior, noise)?;
+            let left = total.quadratic(&frame.residual(&found.x, found.set)) / total.rows;
+            tried.alpha[0] = found.x[SPRING.start] + if shaped { tried.alpha[0] } else { 0.0 };
+            (tried.alpha[0] > 0.0).then_some((found.log_evidence, tried, left))
+        };
+        let (straight, bent) = (set(1..SPRING.start + 1), set(1..SPRING.end));
+        let best_at = |zero: f64, noise: f64| {
+            let mut from = spring.clone();
+            from.zero = zero;
+            if !shaped {
+                return tried(from, bent, noise);
             }
+            let starts = spring.starts((low + zero).abs().max((high + zero).abs()));
+            let starts = starts.filter_map(|shape| tried(from.shaped(shape), straight, noise));
+            let (_, best, _) = starts.max_by(|a, b| a.0.total_cmp(&b.0))?;
+            let (evidence, _, left) = tried(best.clone(), bent, noise)?; // the shape is one between the starts
+            Some((evidence, best, left))
+        };
+        let left = best_at(middle, noise).map_or(0.0, |(.., left)| left);
+        let noise = noise.max(left * self.correlated);
+        let (here, there) = (best_at(spring.zero, noise), best_at(middle, noise));
+        let line = there
+            .as_ref()
+            .filter(|_| !shaped)
+            .and_then(|(_, there, _)| tried(there.clone(), straight, noise));
+        let least = here.iter().chain(&line).map(|(evidence, ..)| evidence + rarity());
+        let least = least.fold(f64::NEG_INFINITY, f64::max);
+        // Of a series the zero is found within the deflections by moving it.
+        let may = !self.lost && (shaped || !self.is_on_both_sides());
+        let most = USEFUL.powi(2) * balance::variance(total, balance::TORQUE);
+        if may && there.is_some_and(|(evidence, _, left)| evidence > least && left < most) {
+            self.off = middle;
+        } else if let Some((_, found, _)) = here.filter(|_| spring.is_searched()) {
+            self.spring.alpha = found.alpha;
+            self.spring.known = true;
         }
-        self.spring.known |= best.is_some();
     }
 
     /// Start a polynomial of which nothing is known with the stiffness that explains the deflection, a late link beside it.
@@ -111,7 +137,7 @@ impl Blocks {
             self.noise.variance = 1e-4 * torque;
         }
         let few = self.ring.len() <= FEWEST && self.before.is_none();
-        if self.spring.is_searched() && (few || !self.spring.known) {
+        if few || !self.spring.known {
             self.start(total, self.noise.variance * self.correlated);
         }
         if few && !self.spring.is_anchored() && matches!(self.spring.law, Law::Polynomial | Law::Linear) {
@@ -135,7 +161,7 @@ impl Blocks {
         self.ring.iter().for_each(|(block, _)| total.add(block, 1.0));
         let torque = balance::variance(&total, balance::TORQUE).max(f64::MIN_POSITIVE);
         self.begin(&total, torque);
-        if !self.is_located(&total) {
+        if self.off != 0.0 || !self.is_located(&total) {
             return;
         }
         self.fit_projection();
@@ -250,7 +276,7 @@ impl Blocks {
             groups[CANDIDATES.len() + i] = terms;
             groups[ALONE + i] = if corner == 0 { 0 } else { terms | corner };
         }
-        if self.lost && self.spring.is_constant() {
+        if self.lost && self.spring.is_constant() && !self.spring.is_open() {
             // What depends on where the zero is says nothing while no motion tells.
             groups.iter_mut().filter(|group| **group & !anywhere() != 0).for_each(|group| *group = 0);
         }

@@ -67,12 +67,14 @@ impl Side {
             return [None; 2];
         }
         let lost = self.blocks.is_lost();
-        let least = valid_within * self.blocks.torque_rms();
+        let usual = self.blocks.torque_rms();
+        let size = if usual.is_nan() { part.flexibility_torque.abs() } else { usual }; // no rows, no recording yet
+        let least = valid_within * size;
         let imprecise = part.flexibility_torque_std >= least || part.flexibility_torque_std.is_nan();
-        let guessed = self.blocks.zero_torque(part.stiffness) >= least;
+        let guessed = self.blocks.zero_torque(part.stiffness) >= least || self.blocks.is_zero_guessed();
         let elsewhere = lost || guessed || part.stiffness * self.blocks.zero_std() >= least;
         let why = |reason| if elsewhere { Reason::Lost } else { reason };
-        let share = part.flexibility_torque_std / self.blocks.torque_rms();
+        let share = part.flexibility_torque_std / size;
         let torque = (imprecise || guessed).then(|| why(Reason::TorqueImprecise(share)));
         let stiffness = Reason::of_precision(part.stiffness, part.stiffness_std, valid_within);
         [stiffness.map(why), torque]

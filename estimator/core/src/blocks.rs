@@ -283,6 +283,9 @@ impl Blocks {
             self.waiting.push(block);
             return self.decide();
         }
+        if self.suspected {
+            return self.bear_out(block);
+        }
         self.good += 1;
         self.push(block);
         if self.doubting && self.good < CONVINCING {

@@ -325,6 +325,12 @@ impl Odds {
         self.of.iter_mut().zip(share).for_each(|(one, share)| one.probability = share);
     }
 
+    /// How many times as well as what is known a cause explains the window.
+    #[must_use]
+    pub fn against_nothing(&self, cause: Cause) -> f64 {
+        (self.log[cause as usize] - self.log[Cause::Nothing as usize]).exp()
+    }
+
     /// What is said of a cause.
     #[must_use]
     pub fn of(&self, cause: Cause) -> &Explanation {

@@ -150,13 +150,10 @@ impl Blocks {
     fn locate(&self, total: &Gram) -> Option<f64> {
         let (before, [low, high]) = (self.before.as_ref()?, self.seen);
         let step = before.deflection.max(high - low) / f64::from(ZEROS);
-        let mut found = [[(f64::NEG_INFINITY, 0.0); TRIED]; 2];
-        found[0] = self.tried(before, &self.spring, total, step);
-        if before.knows_spring() {
-            let (other, spring) = self.another(before);
-            found[1] = self.tried(&other, &spring, total, step);
-            found[1].iter_mut().for_each(|one| one.0 -= rarity());
-        }
+        let (other, spring) = self.another(before);
+        let mut found =
+            [self.tried(before, &self.spring, total, step), self.tried(&other, &spring, total, step)];
+        found[1].iter_mut().for_each(|one| one.0 -= rarity());
         let found = found.as_flattened();
         let best = found.iter().copied().max_by(|a, b| a.0.total_cmp(&b.0))?;
         let rival = |one: &(f64, f64)| (one.1 - best.1).abs() > 2.0 * step && one.0 > best.0 - ACCUSED.ln();
@@ -168,8 +165,8 @@ impl Blocks {
         if !self.lost || self.located || self.spring.is_constant() {
             return true;
         }
-        if self.before.is_none() {
-            self.located = true; // near where deflections are counted from, or sought again
+        if !self.before.as_ref().is_some_and(Before::knows_spring) {
+            self.located = true; // nothing tells where it is but motion near where deflections are counted from
             return true;
         }
         let Some(zero) = self.locate(total) else { return false };

@@ -25,7 +25,7 @@ impl Blocks {
 
     /// Whether the causes say of a block that something has changed.
     pub(super) fn is_unexplained(&self, block: &Gram) -> bool {
-        self.weigh(block).is_some_and(|odds| odds.of(Cause::Nothing).probability < 0.5)
+        self.weigh(block, self.per_block).is_some_and(|odds| odds.of(Cause::Nothing).probability < 0.5)
     }
 
     /// Whether the last blocks together, each of which was explained, show a change: it may be slow. Noise that no cause
@@ -38,7 +38,7 @@ impl Blocks {
         let mut window = block(0).clone();
         let shows = |k: &usize| {
             window.add(block(k - 1), 1.0);
-            self.weigh(&window).is_some_and(|odds| {
+            self.weigh(&window, self.per_block).is_some_and(|odds| {
                 odds.of(Cause::Nothing).probability + odds.of(Cause::Noise).probability < 0.5
             })
         };
@@ -50,8 +50,36 @@ impl Blocks {
         true
     }
 
+    /// Blocks since a restart that what was known explains: a zero as before is believed where these say so, as a zero
+    /// elsewhere was as likely; a motion that does not tell the two apart says nothing.
+    pub(super) fn bear_out(&mut self, block: Gram) -> Closed {
+        self.waiting.push(block);
+        let mut window = Gram::default();
+        self.waiting.iter().for_each(|one| window.add(one, 1.0));
+        let elsewhere =
+            self.weigh(&window, 0.5).map_or(0.0, |odds| odds.against_nothing(Cause::PositionZero));
+        if elsewhere > 1.0 {
+            self.end_doubt();
+            return Closed::Lost;
+        }
+        if self.waiting.len() < CONVINCING || elsewhere > EVEN {
+            if self.waiting.len() >= FEWEST {
+                self.waiting.remove(0);
+            }
+            return Closed::Unexplained;
+        }
+        for block in std::mem::take(&mut self.waiting) {
+            self.push(block);
+        }
+        self.end_doubt();
+        self.solve();
+        Closed::Added
+    }
+
     /// The probability of each cause for some rows; `None`: nothing is known to hold them against.
-    fn weigh(&self, rows: &Gram) -> Option<Odds> {
+    ///
+    /// `before`: that something has changed, before any of them.
+    fn weigh(&self, rows: &Gram, before: f64) -> Option<Odds> {
         let (frame, posterior) = (self.frame.as_ref()?, self.posterior.as_ref()?);
         let projection = self.projection.as_ref().filter(|_| self.is_reference())?;
         let known = Known {
@@ -71,7 +99,7 @@ impl Blocks {
         // Each block has a level of its own.
         let tails = self.noise.tails * (rows.rows / self.rows).max(1.0);
         let noise = Noise { variance: self.own * self.own, tails, ..self.noise };
-        Some(known.judge(rows, &noise, self.per_block))
+        Some(known.judge(rows, &noise, before))
     }
 
     /// Whether a change of the joint explains what waits.
@@ -89,10 +117,10 @@ impl Blocks {
     fn weigh_waiting(&mut self) -> Option<Odds> {
         let mut window = Gram::default();
         self.waiting.iter().for_each(|one| window.add(one, 1.0));
-        let odds = self.weigh(&window)?;
+        let odds = self.weigh(&window, self.per_block)?;
         if self.waiting.len() > 2 && !self.is_change(&odds) {
             window.add(&self.waiting[0], -1.0);
-            if let Some(later) = self.weigh(&window).filter(|later| self.is_change(later)) {
+            if let Some(later) = self.weigh(&window, self.per_block).filter(|later| self.is_change(later)) {
                 self.waiting.remove(0);
                 return Some(later);
             }

@@ -296,3 +296,12 @@ def test_encoders_that_count_from_anywhere_from_the_start_are_no_reason_to_be_ne
     assert np.median(off) < 2e-3
     assert not np.any(kit.wrong(found, truth.sigma[:, 0, 0]))
     assert not np.any(kit.wrong_torque(found, truth.tau_e[:, 0, 0]))
+
+
+def test_a_zero_that_is_right_is_not_sought_elsewhere():
+    """Also where no start that reaches as far is near the shape: a joint is then valid two seconds later."""
+    motion = kit.motion("vsa-ii", 8.0)
+    found, estimator = kit.play(kit.declared("vsa-ii", parameters={}), motion.samples)
+    assert not any(estimator.undeclared())
+    assert np.mean(found.valid[3000:]) > 0.99
+    assert not np.any(kit.wrong(found, motion.stiffness_nm_rad))

@@ -69,7 +69,7 @@ impl Blocks {
             let found = solve(&frame.reduce(total), frame.set & (asked | 1 << LATE), &prior, noise)?;
             let left = total.quadratic(&frame.residual(&found.x, found.set)) / total.rows;
             tried.alpha[0] = found.x[SPRING.start] + if shaped { tried.alpha[0] } else { 0.0 };
-            (tried.alpha[0] > 0.0).then_some((found.log_evidence, tried, left))
+            Some((found.log_evidence, tried, left))
         };
         let (straight, bent) = (set(1..SPRING.start + 1), set(1..SPRING.end));
         let best_at = |zero: f64, noise: f64| {
@@ -80,7 +80,8 @@ impl Blocks {
             }
             let starts = spring.starts((low + zero).abs().max((high + zero).abs()));
             let starts = starts.filter_map(|shape| tried(from.shaped(shape), straight, noise));
-            let (_, best, _) = starts.max_by(|a, b| a.0.total_cmp(&b.0))?;
+            let (_, best, _) =
+                starts.filter(|(_, one, _)| one.alpha[0] > 0.0).max_by(|a, b| a.0.total_cmp(&b.0))?;
             let (evidence, _, left) = tried(best.clone(), bent, noise)?; // the shape is one between the starts
             Some((evidence, best, left))
         };
@@ -96,7 +97,10 @@ impl Blocks {
         // Of a series the zero is found within the deflections by moving it.
         let may = !self.lost && (shaped || !self.is_on_both_sides());
         let most = USEFUL.powi(2) * balance::variance(total, balance::TORQUE);
-        if may && there.is_some_and(|(evidence, _, left)| evidence > least && left < most) {
+        let found = |(evidence, spring, left): &(f64, Spring, f64)| {
+            *evidence > least && *left < most && spring.alpha[0] > 0.0
+        };
+        if may && there.as_ref().is_some_and(found) {
             self.off = middle;
         } else if let Some((_, found, _)) = here.filter(|_| spring.is_searched()) {
             self.spring.alpha = found.alpha;
